@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.lanes.find import MappedSegment
+from datagen.lanes.path import distances_seen
 from datagen.lanes.scale import LaneWidth, ahead_sigma, fitted_width
 from datagen.prepare import PreparedDrive
 from datagen.slam.camera.coarse import with_known_scale
@@ -54,10 +55,11 @@ class AssembledMap:
 
 def near_points(solved: SolvedSegment) -> list[Float[np.ndarray, "_ 2"]]:
     """Edge points of each frame that are near enough to be drawn, in the scale of the segment's camera."""
-    points, reach_cm = [], _DRAWN_HEIGHTS * solved.camera.mounting.height_cm
+    mounting = solved.camera.mounting
+    points, reach_cm = [], _DRAWN_HEIGHTS * mounting.height_cm
     for k in range(len(solved.poses)):
         seen = solved.scans.points_cm[solved.scans.frame(k)]
-        seen = seen[np.hypot(seen[:, 0], seen[:, 1]) < reach_cm]
+        seen = seen[distances_seen(seen, mounting.lead_cm) < reach_cm]
         points.append(map_from_car(seen, solved.poses[k], solved.camera.wheelbase_cm))
     return points
 

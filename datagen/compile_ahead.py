@@ -46,7 +46,9 @@ def _made_up_drive() -> None:
     points = np.stack([np.linspace(-1.0, 1.0, 9), np.linspace(2.0, 3.0, 9)], axis=1) * height_cm
     normals = np.tile([1.0, 0.0], (len(points), 1))
     edges = EdgePixels(camera.project_ground(points), normals)
-    true_borders([edges] * _FRAMES, RoadTable(camera, mapping_range(height_cm, settings.perception.range)))
+    true_borders(
+        [edges] * _FRAMES, RoadTable(camera, mapping_range(camera.mounting, settings.perception.range))
+    )
     scans = pack_scans([RoadEdges(points, normals)] * _FRAMES, height_cm)
     odometry = Odometry(steps, turns)
     motion = motion_about(odometry, settings.motion, height_cm, np.ones(_FRAMES))

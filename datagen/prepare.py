@@ -34,7 +34,7 @@ _SAME = 1.0
 #: times as much as neighbours. Chosen: noise and flicker change both alike, motion changes distant frames
 #: more.
 _NOISY_SAME, _NOISY_RATIO = 4.0, 1.3
-#: Least median number of edge points in the lower half of a frame. Chosen: one border of one line, 20 px
+#: Least median number of edge points in the lower two thirds of a frame. Chosen: a border of one line, 20 px
 #: long.
 _LEAST_EDGES = 20
 #: Share of frames without a readable image above which a drive is not mapped. Chosen: more is no accident.
@@ -335,12 +335,13 @@ def check_edges(drive: Drive, settings: EdgeSettings) -> None:
     """
     counts = []
     for k in np.unique(np.linspace(0, len(drive) - 1, _CHECKED).astype(int)).tolist():
-        # The horizon is unknown without a camera; most cameras show road in the lower half.
+        # The horizon is unknown without a camera; below the upper third most cameras show road, and a steep
+        # one shows its lines hardly any lower.
         image = drive.image(k)
-        counts.append(len(find_edges(image[image.shape[0] // 2 :], settings).uv_px))
+        counts.append(len(find_edges(image[image.shape[0] // 3 :], settings).uv_px))
     if np.median(counts) < _LEAST_EDGES:
         raise TrackingLostError(
-            f"{drive.path}: {np.median(counts):.0f} edge points in the lower half of a frame, expected "
+            f"{drive.path}: {np.median(counts):.0f} edge points in the lower two thirds of a frame, expected "
             f"{_LEAST_EDGES} at least: no line is visible"
         )
 

@@ -193,7 +193,7 @@ def _pictures(attempt: Attempt, drive: Drive) -> tuple[list[Picture], list[Pictu
     keep, camera = np.full((drive.height, drive.width), 255, np.uint8), attempt.known_camera
     if camera is not None:
         try:
-            keep = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range)).keep
+            keep = RoadTable(camera, mapping_range(camera.mounting, perception.range)).keep
         except CalibrationError:  # it sees no road: all edges lie elsewhere
             keep = np.zeros_like(keep)
     raw, edges = [], []

@@ -93,7 +93,10 @@ def find_lane(
     height = segment.camera.mounting.height_cm
     revisits = [(revisit.earlier, revisit.later) for revisit in segment.revisits_within_parts]
     step_cm, ahead_cm = STEP_HEIGHTS * height, AHEAD_HEIGHTS * height
-    shared = shared_path(segment.poses, segment.part, revisits, step_cm, ahead_cm, height)
+    camera = segment.camera
+    # Of a point as far behind the camera as the rear axle of a car whose camera is above the front axle.
+    lead_cm = camera.mounting.lead_cm
+    shared = shared_path(segment.poses, segment.part, revisits, step_cm, ahead_cm, height, lead_cm)
     scans, side_cm = without_frames(segment.scans, held_out), trace.side_heights * height
     path, edges = edges_of_segment(segment, scans, shared, _OWN_LANE_REACH * (lane_width_cm or 0.0))
     edges = without_crossings(path, edges, height, side_cm)
@@ -110,7 +113,7 @@ def find_lane(
     adjacent = without_crossings(path, adjacent.towards_dark() if dark else adjacent, height, side_cm)
     lane = trace_adjacent(path, adjacent, lane, height, trace)
     lines = fit_lines(path, edges, lane, height, fit, adjacent)
-    near = edges_on_map(scans, segment.poses, segment.camera.wheelbase_cm, _KINK_HEIGHTS * height)
+    near = edges_on_map(scans, segment.poses, camera.wheelbase_cm, _KINK_HEIGHTS * height, lead_cm)
     near = near.towards_dark() if dark else near
     lines = [with_kinks(line, near, height) if line.rank == 0 else line for line in lines]
     return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm)

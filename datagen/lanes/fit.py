@@ -244,6 +244,8 @@ class _Fitter:
 def parallel_offset(path: Path, d_cm: Samples, apart_cm: Samples) -> Samples:
     """Offset from the path of the line parallel to another one.
 
+    Inside a corner the parallel runs back and crosses itself; its loop is left out.
+
     Args:
         path: The path.
         d_cm: Smooth offset of the known line at each path sample.
@@ -259,7 +261,34 @@ def parallel_offset(path: Path, d_cm: Samples, apart_cm: Samples) -> Samples:
     offset = np.sum(step * path.left[at], axis=1)
     s = path.s_cm[at] + ahead
     order = np.argsort(s, kind="stable")
-    return np.interp(path.s_cm, s[order], offset[order], period=path.period_cm)
+    found = np.interp(path.s_cm, s[order], offset[order], period=path.period_cm)
+    ends = s, offset
+    if path.period_cm is not None:
+        half = 0.5 * path.period_cm
+        s = path.s_cm + np.mod(s - path.s_cm + half, path.period_cm) - half
+        ends = np.append(s, s[0] + path.period_cm), np.append(offset, offset[0])
+    if (np.diff(ends[0]) > 0.0).all():
+        return found
+    sign = 1.0 if float(np.median(apart_cm)) > 0.0 else -1.0
+    outer = _outermost(path, ends[0], sign * ends[1])
+    return np.where(np.isfinite(outer), sign * outer, found)
+
+
+def _outermost(path: Path, s_cm: Samples, offset_cm: Samples) -> Samples:
+    """Largest offset at each path sample of a line that may run back; NaN where it does not pass."""
+    m, step = len(path.xy_cm), path.step_cm
+    outer = np.full(m, -np.inf)
+    for k in range(len(s_cm) - 1):
+        low, high = sorted((s_cm[k], s_cm[k + 1]))
+        rows = np.arange(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)
+        if not path.closed:
+            rows = rows[(rows >= 0) & (rows < m)]
+        if not rows.size:
+            continue
+        share = (rows * step - s_cm[k]) / (s_cm[k + 1] - s_cm[k] or 1.0)
+        there = offset_cm[k] + share * (offset_cm[k + 1] - offset_cm[k])
+        outer[rows % m] = np.maximum(outer[rows % m], there)
+    return np.where(np.isfinite(outer), outer, np.nan)
 
 
 def distance_across(path: Path, from_cm: Samples, to_cm: Samples, known: SampleMask) -> Samples:

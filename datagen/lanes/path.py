@@ -130,6 +130,7 @@ def shared_path(
     step_cm: float,
     ahead_cm: float,
     camera_height_cm: float,
+    lead_cm: float = 0.0,
 ) -> Path | None:
     """Find the path that all visits share, one lap as a rule, and the position of every frame on it.
 
@@ -145,16 +146,20 @@ def shared_path(
         step_cm: Approximate distance between samples.
         ahead_cm: Length to add at the end of an open road.
         camera_height_cm: Sets the scale of bounds.
+        lead_cm: Distance ahead of the rear axle of the point whose path it is. The axle of a long car cuts
+            corners, up to over the line on the inside, while what its camera sees stays in the lane.
 
     Returns:
         The path, closed where it is a lap; None if the visits share none: the drive is in one part without a
         revisit, or too many frames lie elsewhere.
     """
-    ends = _ends_of_lap(poses, revisits)
+    led = poses.copy()
+    led[:, :2] += lead_cm * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    ends = _ends_of_lap(led, revisits)
     if ends is not None:
-        road, closed = poses[ends[0] : ends[1] + 1], True
+        road, closed = led[ends[0] : ends[1] + 1], True
     elif part[-1] > part[0]:
-        road, closed = stitched_road(poses, part, camera_height_cm)
+        road, closed = stitched_road(led, part, camera_height_cm)
     else:
         return None
     road = with_long_steps_filled(road, camera_height_cm)
@@ -253,7 +258,7 @@ class PathEdges:
             :meth:`towards_dark`.
         along: Component of the normal along the path.
         weight: Weight of the point.
-        distance_cm: Distance from the front axle at which it was seen.
+        distance_cm: Distance at which it was seen, see :func:`distances_seen`.
         frame: Frame that saw it.
     """
 
@@ -283,7 +288,7 @@ class MapEdges:
         normals: Unit normals, towards the brighter side.
         frame: Frame that saw each.
         row: Position of the point in the scans.
-        distance_cm: Distance from the front axle at which it was seen.
+        distance_cm: Distance at which it was seen, see :func:`distances_seen`.
     """
 
     xy_cm: Float[np.ndarray, "m 2"]
@@ -297,11 +302,21 @@ class MapEdges:
         return replace(self, normals=-self.normals)
 
 
+def distances_seen(points_cm: Float[np.ndarray, "m 2"], lead_cm: float) -> Float[np.ndarray, "m"]:
+    """Distances of points from the front axle, or from the foot of a camera that is further ahead.
+
+    Args:
+        points_cm: Points, frame car.
+        lead_cm: Of the camera, see :attr:`lanenet.geometry.camera.Mounting.lead_cm`.
+    """
+    return np.hypot(points_cm[:, 0], points_cm[:, 1] - lead_cm)
+
+
 def edges_on_map(
-    scans: Scans, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float, reach_cm: float
+    scans: Scans, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float, reach_cm: float, lead_cm: float = 0.0
 ) -> MapEdges:
-    """Move every frame's edge points up to a distance from its front axle to the map."""
-    distance = np.hypot(scans.points_cm[:, 0], scans.points_cm[:, 1])
+    """Move every frame's edge points up to a distance, see :func:`distances_seen`, to the map."""
+    distance = distances_seen(scans.points_cm, lead_cm)
     keep = distance <= reach_cm
     frame = scans.frame_of_point[keep]
     ahead = np.stack([np.cos(poses[frame, 2]), np.sin(poses[frame, 2])], axis=1)
@@ -314,7 +329,12 @@ def edges_on_map(
 
 
 def edges_along_path(
-    path: Path, scans: Scans, poses: Float[np.ndarray, "n 3"], wheelbase_cm: float, reach_cm: float
+    path: Path,
+    scans: Scans,
+    poses: Float[np.ndarray, "n 3"],
+    wheelbase_cm: float,
+    reach_cm: float,
+    lead_cm: float = 0.0,
 ) -> PathEdges:
     """Express every frame's edge points in path coordinates.
 
@@ -326,10 +346,12 @@ def edges_along_path(
         scans: Edge points per frame.
         poses: Rear-axle poses, frame map.
         wheelbase_cm: Distance between the axles.
-        reach_cm: Largest distance of edge points from the front axle.
+        reach_cm: Largest distance of edge points, see :func:`distances_seen`.
+        lead_cm: Of the camera, see :attr:`lanenet.geometry.camera.Mounting.lead_cm`.
     """
-    edges = edges_on_map(scans, poses, wheelbase_cm, reach_cm)
-    forward, span_cm = path.drives_forward[edges.frame], reach_cm + 2.0 * wheelbase_cm
+    edges = edges_on_map(scans, poses, wheelbase_cm, reach_cm, lead_cm)
+    span_cm = reach_cm + 2.0 * wheelbase_cm + lead_cm
+    forward = path.drives_forward[edges.frame]
     row = _nearest_rows(
         path.xy_cm, path.step_cm, path.closed, path.s_frames_cm[edges.frame], forward, edges.xy_cm, span_cm
     )

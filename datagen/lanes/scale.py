@@ -152,7 +152,9 @@ def edges_of_segment(
     if path is None:
         path = path_of_poses(solved.poses, STEP_HEIGHTS * height, AHEAD_HEIGHTS * height)
     reach_cm = max(_REACH_HEIGHTS * height, least_reach_cm)
-    return path, edges_along_path(path, scans, solved.poses, solved.camera.wheelbase_cm, reach_cm)
+    camera = solved.camera
+    lead_cm = camera.mounting.lead_cm
+    return path, edges_along_path(path, scans, solved.poses, camera.wheelbase_cm, reach_cm, lead_cm)
 
 
 def measure_lane(

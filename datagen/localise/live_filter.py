@@ -180,7 +180,7 @@ class LiveLocaliser:
         self.factor = start.factor
         self.steering: SteeringFit | None = None
         self.segment = self.unreadable = self.standing = self.dropped = 0
-        self._table = RoadTable(camera, mapping_range(self.height_cm, settings.perception.range))
+        self._table = RoadTable(camera, mapping_range(camera.mounting, settings.perception.range))
         self._rng = np.random.default_rng(settings.seed)
         self._intervals_s: deque[float] = deque(maxlen=_TIMES)
         self._held: dict[str, float] = {}
@@ -282,7 +282,13 @@ class LiveLocaliser:
             road = self._table.lift(pixels)
         commands = self._commanded(frame)
         self._t_driven_s = frame.t_s
-        return _Observed(frame.frame, frame.t_s, pixels, pack_scans([road], self.height_cm).scan(0), commands)
+        return _Observed(
+            frame.frame,
+            frame.t_s,
+            pixels,
+            pack_scans([road], self.height_cm, self.camera.mounting.lead_cm).scan(0),
+            commands,
+        )
 
     def _commanded(self, frame: LiveFrame) -> CommandedMotion:
         """What was commanded since the last frame that the filter saw, or that showed a standing car."""

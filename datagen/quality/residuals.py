@@ -246,7 +246,7 @@ def frame_edges(
     """
     camera, perception = mapped.drive_map.camera, mapped.perception
     dark = mapped.drive_map.meta.markings == "dark"
-    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, perception.range))
+    table = RoadTable(camera, mapping_range(camera.mounting, perception.range))
     if not len(rows):
         return
     found = edges_of_drive(mapped.drive.subset(mapped.rows[rows]), perception.edges, table)

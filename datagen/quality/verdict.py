@@ -119,6 +119,9 @@ class VerdictSettings(Settings):
         max_pitch_sigma_rad: Sigma of the camera's pitch, if it was found from the drive. Chosen: 1.7 degrees;
             the principal point takes on most of what the pitch is off. Labels of ``donkey_circuit`` with
             cameras from two parts of it (sigma 0.013 and 0.017) lie 0.4 cm from those of the whole (0.022).
+        min_revisits: Places seen twice that a camera needs which was found from the drive. Chosen: as for
+            ``lanenet calibrate drive``; three that only looked alike passed on a simulated drive, with labels
+            1.7 cm off. The three recorded drives have 38 and more.
         max_closure_heights: Median error of a revisit across the road, in camera heights. A study of three
             recorded drives reached 0.03.
         lane_mismatch: Relative difference between measured and given lane width, if the camera sets the
@@ -145,6 +148,7 @@ class VerdictSettings(Settings):
     max_withheld: float = Field(default=0.15, gt=0.0, lt=1.0)
     max_focal_sigma: float = Field(default=0.05, gt=0.0)
     max_pitch_sigma_rad: float = Field(default=0.03, gt=0.0)
+    min_revisits: int = Field(default=6, ge=0)
     max_closure_heights: float = Field(default=0.15, gt=0.0)
     lane_mismatch: float = Field(default=0.25, gt=0.0)
     lane_reject: float = Field(default=0.6, gt=0.0)
@@ -460,6 +464,14 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
             _DRIVE_AGAIN,
             f"no place was seen twice, so the focal length is only a guess, here within {_percent(sigma)}, "
             f"expected {_percent(s.max_focal_sigma)} at most (max_focal_sigma)",
+        )
+    elif e.revisits < s.min_revisits and not e.height_given:
+        yield Finding(
+            "reject",
+            "the drive does not show what camera this is, for hardly any place was seen twice",
+            _DRIVE_AGAIN,
+            f"the camera was found from {counted(e.revisits, 'place')} seen twice, expected "
+            f"{s.min_revisits}: fewer may look alike by chance (min_revisits)",
         )
     elif (sigma := e.sigma.get("focal", 0.0)) > s.max_focal_sigma:
         yield Finding(

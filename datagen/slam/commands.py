@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from lanenet.data.drives import Commands, Drive
 from lanenet.geometry.frames import left_from_donkey
@@ -44,12 +44,14 @@ class CommandedMotion:
         turn: Per frame, something proportional to curvature (tan of steering over wheelbase, [1/cm], or
             Donkeycar's angle), or None.
         periods: Time from the frame before to each frame, in typical time steps; 1 where there is no gap.
+        uneven: Where that time is another one, by the images, though none was recorded; None for nowhere.
     """
 
     distance_cm: Float[np.ndarray, "n"]
     speed_known: bool
     turn: Float[np.ndarray, "n"] | None
     periods: Float[np.ndarray, "n"]
+    uneven: Bool[np.ndarray, "n"] | None = None
 
     @classmethod
     def without_gaps(

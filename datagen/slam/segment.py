@@ -34,7 +34,7 @@ from datagen.slam.loops.revisits import PlaceMatcher, Revisit, propose_beside, p
 from datagen.slam.odometry.scans import Scans
 from datagen.slam.settings import SlamSettings
 from datagen.slam.track import track
-from datagen.slam.view import RoadView, SegmentView, view_road, view_segment
+from datagen.slam.view import RoadView, SegmentView, view_road, view_segment, with_measured_periods
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.poses import path_lengths
@@ -201,6 +201,7 @@ class SegmentSolver:
         view = view_segment(drive, camera, commands, self.settings, self.rng)
         keys = choose_keyframes(view.steps_heights, commands.part)
         if len(keys) == len(drive):
+            view = with_measured_periods(view)
             return _DenseSegment(view, self, find_camera, prior_camera or camera).solve()
         # The keyframes show the step length better: if the car is still slow, they are thinned again.
         between = commands_between(commands, keys)

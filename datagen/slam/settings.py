@@ -20,6 +20,10 @@ class GuessSettings(Settings):
             mean is the prior. The range covers the lenses of the three real drives (79 to 105 px) with a
             margin.
         pitch_deg: Downward pitches to try. The real drives have 13 to 18 degrees.
+        steep_focal_px: Focal lengths to try, as above, where none of these cameras shows the motion clearly.
+            Chosen: a third apart.
+        steep_pitch_deg: Pitches to try then: a camera that looks at the road just before the car.
+        steep_roll_deg: Rolls to try then: a pan and tilt bracket, or one bent by hand, is seldom level.
         k1: First coefficient of the fisheye; the real drives have -0.03 to -0.07.
         lever_heights: Distance of the camera ahead of the rear axle; 0.9 on a Donkeycar.
         wheelbase_cm: Distance between the axles, which sets where y = 0 lies under the car; 17 cm is a
@@ -29,6 +33,9 @@ class GuessSettings(Settings):
 
     focal_px: tuple[float, ...] = (65.0, 80.0, 95.0, 110.0)
     pitch_deg: tuple[float, ...] = (7.0, 11.0, 15.0, 19.0, 23.0)
+    steep_focal_px: tuple[float, ...] = (60.0, 78.0, 101.0, 131.0)
+    steep_pitch_deg: tuple[float, ...] = (19.0, 25.0, 31.0, 37.0)
+    steep_roll_deg: tuple[float, ...] = (-12.0, -6.0, 0.0, 6.0, 12.0)
     k1: float = -0.03
     lever_heights: float = Field(default=0.9, gt=0.0)
     wheelbase_cm: float = Field(default=17.0, gt=0.0)

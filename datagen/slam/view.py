@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -14,11 +14,12 @@ from datagen.slam.odometry.image_pairs import ImagePairs
 from datagen.slam.odometry.odometry import TypicalStep, typical_step
 from datagen.slam.odometry.scans import Scans, edges_of_drive, scans_of
 from datagen.slam.odometry.stillness import without_reflections
+from datagen.slam.odometry.uneven import early_frames, measured_periods
 from datagen.slam.settings import SlamSettings
 from datagen.slam.stripes import true_borders
 from lanenet.data.drives import Drive
 from lanenet.errors import TrackingLostError
-from lanenet.geometry.camera import Camera
+from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 
@@ -32,11 +33,12 @@ _REACH_HEIGHTS = 6.0
 _LEAST_POINTS = 20
 
 
-def mapping_range(camera_height_cm: float, base: RangeSettings) -> RangeSettings:
+def mapping_range(mounting: Mounting, base: RangeSettings) -> RangeSettings:
     """Range of the road for mapping, in proportion to the camera's height; rows stay as configured."""
-    reach = _REACH_HEIGHTS * camera_height_cm
-    coarsest = _COARSEST_HEIGHTS * camera_height_cm
-    return base.model_copy(update={"far_cm": reach, "side_cm": reach, "max_cm_per_px": coarsest})
+    reach = _REACH_HEIGHTS * mounting.height_cm
+    coarsest = _COARSEST_HEIGHTS * mounting.height_cm
+    far = reach + mounting.lead_cm
+    return base.model_copy(update={"far_cm": far, "side_cm": reach, "max_cm_per_px": coarsest})
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,12 @@ class RoadView:
     def observed(self, commands: CommandedMotion) -> Observations:
         """For the bundle adjustment: the edges, with what was commanded and how long each step took."""
         return Observations(
-            self.edges, self.keep, commands.relative_steps, commands.speed_known, commands.periods
+            self.edges,
+            self.keep,
+            commands.relative_steps,
+            commands.speed_known,
+            commands.periods,
+            commands.uneven,
         )
 
 
@@ -77,7 +84,7 @@ def view_road(
         settings: How edges are found.
         keys: Keyframes of a slow car: what stands still is recognised over as much road as between them.
     """
-    limits = mapping_range(camera.mounting.height_cm, settings.perception.range)
+    limits = mapping_range(camera.mounting, settings.perception.range)
     table = RoadTable(camera, limits)
     found = [on_road(pixels, table) for pixels in edges_of_drive(drive, settings.perception.edges, table)]
     kept = list(found)
@@ -119,6 +126,21 @@ class SegmentView:
     def steps_heights(self) -> Float[np.ndarray, "n"]:
         """Rough step length of each frame, in camera heights."""
         return self.typical.step_heights * self.typical.relative
+
+
+def with_measured_periods(view: SegmentView) -> SegmentView:
+    """Measure the times of frames that came unevenly, see :mod:`datagen.slam.odometry.uneven`.
+
+    A recorded speed knows the steps better.
+    """
+    early = early_frames(view.drive)
+    if view.commands.speed_known or not early.any():
+        return view
+    periods, uneven = measured_periods(view.images, view.typical.step_heights, early)
+    images = view.images.with_periods(np.where(uneven, periods, view.images.periods))
+    typical = replace(view.typical, relative=view.typical.relative * periods)
+    # Later stages start from the odometry; these times are too rough to be held against them.
+    return replace(view, commands=replace(view.commands, uneven=uneven), images=images, typical=typical)
 
 
 def view_segment(

@@ -79,7 +79,7 @@ def solve_together(visits: Sequence[Visit], shared: bool, rng: np.random.Generat
         observed = _as_seen_by(visits, camera)
         found = adjust(observed, estimate, settings.bundle, rng, (), loops)
         edges = list(observed.edges)
-    limits = mapping_range(camera.mounting.height_cm, settings.perception.range)
+    limits = mapping_range(camera.mounting, settings.perception.range)
     scans = scans_of(edges, found.camera, limits, found.tilt)
     ends = np.cumsum([0, *np.bincount(of)])
     adjusted = []

@@ -43,6 +43,14 @@ class Mounting:
     right_of_centre_cm: float = 0.0
 
     @property
+    def lead_cm(self) -> float:
+        """How far the optical centre is ahead of the front axle; 0 behind it.
+
+        What is near to a camera far before the axle is not near to the axle.
+        """
+        return max(self.ahead_of_front_axle_cm, 0.0)
+
+    @property
     def position_car_cm(self) -> Float[np.ndarray, "3"]:
         """Optical centre, [cm], frame car with z up."""
         return np.array([self.right_of_centre_cm, self.ahead_of_front_axle_cm, self.height_cm])

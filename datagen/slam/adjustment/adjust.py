@@ -78,6 +78,9 @@ _LEAST_STEP = 0.1
 _PARTS = 8
 #: Numbers of a band of the equations up to which it is solved as one: 400 MB.
 _MOST_BAND = 50_000_000
+#: Sigmas of the change of step, in camera heights, and of turn, where frames come at uneven times. Chosen: as
+#: much as a usual step, and a usual turn in a bend.
+_UNEVEN_STEP, _UNEVEN_TURN_RAD = 0.2, 0.05
 #: Sigma of the first pose, which only fixes the map: far below anything that is measured.
 _FIXED_SIGMA = 1e-6
 
@@ -519,6 +522,7 @@ def frame_priors(
     """
     s, n = settings, len(state.poses)
     periods = np.ones(n) if observed.periods is None else observed.periods
+    uneven = np.zeros(n, dtype=bool) if observed.uneven is None else observed.uneven
     # Nothing is assumed across a long gap.
     j = np.flatnonzero(periods[1:] <= MOST_BRIDGED) + 1
     i = j - 1
@@ -544,7 +548,8 @@ def frame_priors(
     b = a + 1
     both_at = np.concatenate([step_at[b], step_at[a]], axis=1)
     # Steps per commanded step; nothing is assumed of steps for which the car was commanded to stand.
-    commanded = (np.ones(n) if observed.relative_steps is None else observed.relative_steps)[j]
+    commanded = np.ones(n) if observed.relative_steps is None else observed.relative_steps
+    commanded = commanded[j]
     per = np.where(commanded > 0.0, 1.0 / np.maximum(commanded, _LEAST_STEP), 0.0)
     per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
     speed_by = np.concatenate([per_b[:, None] * along_by[b], -per_a[:, None] * along_by[a]], axis=1)
@@ -552,15 +557,18 @@ def frame_priors(
     time = periods[j]
     longer = np.maximum(time[a], time[b])
     rate = (1.0 / time)[:, None]
+    either = uneven[j[a]] | uneven[j[b]]
+    speed_sigma = np.where(either, _UNEVEN_STEP, s.speed_change * longer)
+    turn_sigma = np.where(either, _UNEVEN_TURN_RAD, s.turn_change * np.sqrt(longer))
     # Each prior: residual, sigma, and the unknowns that it depends on with the Jacobian by them.
     priors = [
         (state.tilt[:, 0], s.frame_pitch, own + 3, np.ones((n, 1))),
         (state.tilt[:, 1], s.frame_roll, own + 4, np.ones((n, 1))),
         (across, s.slip * time**1.5, step_at, across_by),
-        (per_b * along[b] - per_a * along[a], s.speed_change * longer, both_at, speed_by),
+        (per_b * along[b] - per_a * along[a], speed_sigma, both_at, speed_by),
         (
             turn[b] / time[b] - turn[a] / time[a],
-            s.turn_change * np.sqrt(longer),
+            turn_sigma,
             both_at,
             np.concatenate([rate[b] * turn_by[b], -rate[a] * turn_by[a]], axis=1),
         ),

@@ -99,6 +99,7 @@ class Observations:
         speed_recorded: Whether these come from a recorded speed.
         periods: Time from the frame before to each frame, in typical time steps (see
             :class:`datagen.slam.commands.CommandedMotion`); None for a drive without gaps.
+        uneven: Where that time is another one that is not known closely; None for nowhere.
     """
 
     edges: Sequence[EdgePixels]
@@ -106,6 +107,7 @@ class Observations:
     relative_steps: Float[np.ndarray, "n"] | None = None
     speed_recorded: bool = False
     periods: Float[np.ndarray, "n"] | None = None
+    uneven: Bool[np.ndarray, "n"] | None = None
 
 
 @dataclass(frozen=True)

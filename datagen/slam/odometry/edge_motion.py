@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from lanenet.perception.edges.canny import to_gray
 
@@ -39,17 +39,43 @@ def edges_moved(before: UInt8[np.ndarray, "h w *c"], after: UInt8[np.ndarray, "h
         before: An image, colour or gray.
         after: The next one.
     """
+    change, slope, strong = _change_at_edges(before, after)
+    if not strong.any():
+        return False
+    at_edges, everywhere = np.quantile(change[strong], 0.9), np.quantile(change, 0.9)
+    return _shift_px(change, slope, strong) > _MOVED_PX and bool(at_edges > _ABOVE_NOISE * everywhere)
+
+
+def edge_shift_px(before: UInt8[np.ndarray, "h w *c"], after: UInt8[np.ndarray, "h w *c"]) -> float:
+    """Return the shift of the tenth of the strongest edges that moves most, up to about their width.
+
+    Args:
+        before: An image, colour or gray.
+        after: The next one.
+
+    Returns:
+        In pixels of an image 160 px wide; NaN without an edge.
+    """
+    change, slope, strong = _change_at_edges(before, after)
+    return _shift_px(change, slope, strong) if strong.any() else float("nan")
+
+
+def _shift_px(
+    change: Float32[np.ndarray, "h w"], slope: Float32[np.ndarray, "h w"], strong: Bool[np.ndarray, "h w"]
+) -> float:
+    return float(np.quantile(change[strong] / slope[strong], 0.9))
+
+
+def _change_at_edges(
+    before: UInt8[np.ndarray, "h w *c"], after: UInt8[np.ndarray, "h w *c"]
+) -> tuple[Float32[np.ndarray, "h2 w2"], Float32[np.ndarray, "h2 w2"], Bool[np.ndarray, "h2 w2"]]:
+    """Change of brightness and slope at each pixel of two images, and where the strongest edges are."""
     first, second = _without_light(before), _without_light(after)
     middle = 0.5 * (first + second)
     # Sobel's kernel adds up to eight times the slope.
     slope = np.hypot(cv2.Sobel(middle, cv2.CV_32F, 1, 0), cv2.Sobel(middle, cv2.CV_32F, 0, 1)) / 8.0
-    change = np.abs(first - second)
     strong = slope >= max(float(np.quantile(slope, 1.0 - _STRONGEST)), _LEAST_GRADIENT)
-    if not strong.any():
-        return False
-    at_edges, everywhere = np.quantile(change[strong], 0.9), np.quantile(change, 0.9)
-    shift_px = float(np.quantile(change[strong] / slope[strong], 0.9))
-    return shift_px > _MOVED_PX and bool(at_edges > _ABOVE_NOISE * everywhere)
+    return np.abs(first - second), slope, strong
 
 
 def _without_light(image: UInt8[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "h2 w2"]:

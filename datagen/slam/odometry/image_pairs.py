@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple, no_type_check
 
 import numpy as np
@@ -147,7 +148,8 @@ class ImagePairs:
         self.periods = np.ones(len(edges)) if periods is None else periods
         self.settings, self._camera = settings, camera
         self._sigma_px = settings.sigma_px * max(1.0, camera.width / _FINE_WIDTH)
-        ahead = np.arange(0.0, _REACH_HEIGHTS, _CELL_HEIGHTS)
+        m = camera.mounting
+        ahead = np.arange(0.0, _REACH_HEIGHTS + m.lead_cm / m.height_cm, _CELL_HEIGHTS)
         left = np.arange(-_REACH_HEIGHTS, _REACH_HEIGHTS, _CELL_HEIGHTS)
         grid_cm = camera.mounting.height_cm * np.stack(np.meshgrid(ahead, left, indexing="ij"), -1)
         car_cm = np.stack([-grid_cm[..., 1], grid_cm[..., 0] - camera.wheelbase_cm], axis=-1)
@@ -160,6 +162,12 @@ class ImagePairs:
 
     def __len__(self) -> int:
         return len(self._images)
+
+    def with_periods(self, periods: Float[np.ndarray, "n"]) -> ImagePairs:
+        """Return the same images with other times between them, in typical time steps."""
+        other = copy(self)
+        other.periods = periods
+        return other
 
     @property
     def points_per_frame(self) -> float:

@@ -157,7 +157,8 @@ def follow_motion(
     """
     n = len(log_likelihood)
     time = np.ones(n) if periods is None else np.minimum(periods, LONGEST_STEP)
-    whole = np.rint(time).astype(int).tolist()
+    # Before an image that came early the motion may change as well.
+    whole = np.maximum(np.rint(time).astype(int), 1).tolist()
     by_step, by_turn = (
         {m: np.linalg.matrix_power(once, m) for m in set(whole)}
         for once in (grid.step_changes(), grid.turn_changes())

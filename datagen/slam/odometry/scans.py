@@ -120,7 +120,7 @@ def scans_of(
         parts = [slice(first, first + _AT_ONCE) for first in range(0, len(kept), _AT_ONCE)]
         lifted = in_threads(lambda part: lift_tilted(kept[part], camera, tilt_rad[part]), parts)
         frames = [road for part in lifted for road in part]
-    return pack_scans(frames, camera.mounting.height_cm)
+    return pack_scans(frames, camera.mounting.height_cm, camera.mounting.lead_cm)
 
 
 def seen_edges(pixels: EdgePixels, table: RoadTable) -> EdgePixels:
@@ -160,18 +160,23 @@ def lift_tilted(
     return [RoadEdges(points[a:b], across[a:b]) for a, b in pairwise(ends.tolist())]
 
 
-def pack_scans(frames: list[RoadEdges], camera_height_cm: float) -> Scans:
+def pack_scans(frames: list[RoadEdges], camera_height_cm: float, lead_cm: float = 0.0) -> Scans:
     """Pack per-frame edge points, and weigh them by their distance.
 
     One pixel spans road in proportion to the squared distance, and the position of a far edge is worth less.
     The weight falls to one half at four camera heights, smoothly, so that far points still help with the
     heading.
+
+    Args:
+        frames: Edge points of each frame.
+        camera_height_cm: Sets the scale.
+        lead_cm: Of the camera, see :attr:`lanenet.geometry.camera.Mounting.lead_cm`.
     """
     counts = [len(frame.points_cm) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     points = np.concatenate([np.empty((0, 2)), *(frame.points_cm for frame in frames)])
     normals = np.concatenate([np.empty((0, 2)), *(frame.normals for frame in frames)])
-    distance = np.hypot(points[:, 0], points[:, 1]) / (_HALF_WEIGHT_HEIGHTS * camera_height_cm)
+    distance = np.hypot(points[:, 0], points[:, 1] - lead_cm) / (_HALF_WEIGHT_HEIGHTS * camera_height_cm)
     return Scans(points, normals, 1.0 / (1.0 + distance**4), starts)
 
 

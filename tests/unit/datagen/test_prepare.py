@@ -236,7 +236,7 @@ def test_a_throttle_that_is_negative_forward_is_named(tmp_path, sign, count):
 def test_edges_at_the_rim_of_a_lens_have_no_place_on_the_road():
     """Found in the last pixel that sees the road, and moved a little further: there is no road."""
     camera = guessed_camera(160, 120, 38.0, 30.0, GuessSettings())
-    table = RoadTable(camera, mapping_range(camera.mounting.height_cm, RangeSettings()))
+    table = RoadTable(camera, mapping_range(camera.mounting, RangeSettings()))
     uv = np.array([[80.0, 100.0], [80.0, 2.0]])
     normals = np.array([[0.0, 1.0], [0.0, 1.0]])
     kept = on_road(EdgePixels(uv, normals), table)

@@ -87,3 +87,16 @@ def test_what_varies_along_the_road_is_not_known_in_a_long_gap():
     assert error[gap][1] < 0.5
     level = interpolation_error(path, np.where(gap, np.nan, 40.0))
     np.testing.assert_allclose(level, 0.0)
+
+
+def test_inside_a_corner_the_parallel_does_not_run_back():
+    """Inside a corner of 90 degrees it goes from one leg to the other, without a swallowtail."""
+    path = arc_path(None)
+    at = 0.5 * path.s_cm[-1]
+    corner = np.abs(path.s_cm - at)
+    found = parallel_offset(path, corner, np.full(len(path.s_cm), 50.0))
+    # The legs' parallels meet above the corner: the distance over the cosine of 45 degrees.
+    away = np.abs(path.s_cm - at)
+    inner = away < 0.5 * at
+    np.testing.assert_allclose(found[inner], (corner + 50.0 * np.sqrt(2.0))[inner], atol=2.5)
+    assert (np.abs(np.diff(found))[inner[1:]] < 1.2 * path.step_cm).all()

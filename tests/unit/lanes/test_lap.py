@@ -347,3 +347,17 @@ def test_breaks_are_denser_in_bends():
 
 def test_an_open_path_is_not_a_lap():
     assert arc_path(None).period_cm is None
+
+
+def test_the_path_of_a_point_ahead_of_the_axle_does_not_cut_corners():
+    """On a circle of radius r, a point that far ahead runs around on the hypotenuse."""
+    angle = 2.0 * np.pi * np.arange(400) / 160
+    radius, lead = 50.0, 30.0
+    poses = np.column_stack([radius * np.sin(angle), -radius * np.cos(angle), angle])
+    pairs = [(k, k + 160) for k in range(0, 240, 20)]
+    for lead_cm, expected in ((0.0, radius), (lead, np.hypot(radius, lead))):
+        path = shared_path(poses, _one_part(poses), pairs, 1.8, 75.0, HEIGHT_CM, lead_cm)
+        assert path is not None and path.closed and path.d_frames_cm is not None
+        np.testing.assert_allclose(np.hypot(*path.xy_cm.T), expected, rtol=0.02)
+        # Frames have the places of their rear axles, to the left of it.
+        np.testing.assert_allclose(path.d_frames_cm, expected - radius, atol=1.0)

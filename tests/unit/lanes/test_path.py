@@ -150,6 +150,18 @@ def test_far_points_and_points_beyond_the_path_are_left_out():
     np.testing.assert_allclose(edges.weight, scans.weights[:2])
 
 
+@pytest.mark.parametrize("lead", [0.0, 40.0])
+def test_the_reach_begins_at_a_camera_that_is_far_before_the_axle(lead):
+    path = _exact_path(200.0, None, 1)
+    points = np.array([[0.0, 20.0], [0.0, 59.0], [0.0, 61.0], [0.0, 99.0], [0.0, 101.0]])
+    scans = pack_scans([RoadEdges(points, np.tile([-1.0, 0.0], (5, 1)))], HEIGHT_CM, lead)
+    edges = edges_along_path(path, scans, np.zeros((1, 3)), WHEELBASE_CM, 60.0, lead)
+    np.testing.assert_allclose(edges.s_cm, WHEELBASE_CM + points[points[:, 1] < 60.0 + lead, 1])
+    np.testing.assert_allclose(edges.distance_cm, np.abs(points[: len(edges.s_cm), 1] - lead))
+    # A point at four camera heights has half the weight of one at the camera.
+    assert scans.weights[1] == pytest.approx(1.0 / (1.0 + ((59.0 - lead) / 60.0) ** 4))
+
+
 def test_another_lap_does_not_take_the_points():
     # Two laps around one circle: the second lap's frames see road of the second lap only.
     radius = 60.0

@@ -163,6 +163,9 @@ def test_steering_of_the_wrong_sign_is_named(steering, remarks):
         (OPEN | {"sigma": {"focal": 0.3}}, "reject", "no place was seen twice.* 30 %.*max_focal_sigma"),
         # Only where the focal length is known closely beforehand.
         (OPEN | {"sigma": {"focal": 0.04}}, "usable", "no place was seen twice.* 4 %.*max_focal_sigma"),
+        ({"revisits": 5}, "reject", "5 places seen twice, expected 6.*min_revisits"),
+        ({"revisits": 5, "height_given": True}, "good", "0.40 px"),
+        ({"revisits": 6}, "good", "0.40 px"),
         ({"sigma": {"focal": 0.07}}, "usable", "focal length open by 7.0 %"),
         ({"sigma": {"focal": 0.12}}, "reject", "focal"),
         ({"sigma": {"pitch": 0.04}}, "usable", "pitch open by 0.040 rad"),

@@ -22,6 +22,7 @@ from datagen.slam.odometry.odometry import STEPS_HEIGHTS, best_step
 from datagen.slam.odometry.scans import seen_edges
 from datagen.slam.settings import GuessSettings
 from datagen.slam.view import mapping_range
+from lanenet.geometry.camera import Mounting
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings, RoadTable
 
@@ -81,10 +82,14 @@ def test_a_known_scale_stretches_the_road_and_keeps_the_car(factor):
 
 def test_the_mapping_range_grows_with_the_camera():
     base = RangeSettings(top_row=40, bottom_rows=7)
-    small, large = mapping_range(10.0, base), mapping_range(20.0, base)
+    small, large = (mapping_range(Mounting(height_cm), base) for height_cm in (10.0, 20.0))
     assert (small.far_cm, small.side_cm, small.max_cm_per_px) == pytest.approx((60.0, 60.0, 3.0))
     assert large.far_cm == pytest.approx(2.0 * small.far_cm)
     assert (large.top_row, large.bottom_rows) == (40, 7)
+    # It begins at a camera before the car, not at an axle that the camera does not see.
+    for ahead_cm, far_cm in ((-5.0, 60.0), (25.0, 85.0)):
+        before = mapping_range(Mounting(10.0, ahead_of_front_axle_cm=ahead_cm), base)
+        assert (before.far_cm, before.side_cm) == pytest.approx((far_cm, 60.0))
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
@@ -122,7 +127,7 @@ def test_the_step_is_that_of_the_camera_in_which_one_stands_out():
     pixels = [find_edges(drive.image(k), EdgeSettings()) for k in range(60)]
     pictures = {}
     for name, camera in (("true", true), ("far off", far_off)):
-        table = RoadTable(camera, mapping_range(camera.mounting.height_cm, RangeSettings()))
+        table = RoadTable(camera, mapping_range(camera.mounting, RangeSettings()))
         edges = [seen_edges(frame, table) for frame in pixels]
         pictures[name] = ImagePairs(edges, camera, OdometrySettings(), np.random.default_rng(0))
     relative = np.ones(60)
@@ -143,3 +148,29 @@ def test_the_focal_lengths_to_try_grow_with_the_image():
         camera.intersect_ground(np.array([[240.5, 200.5]])),
         small.intersect_ground(np.array([[120.0, 100.0]])),
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("roll_deg", [9.0, -6.0])
+def test_a_steep_and_rolled_camera_is_found_where_no_level_one_fits(roll_deg):
+    true = fisheye(pitch_down_rad=np.deg2rad(33.0), roll_rad=np.deg2rad(roll_deg), yaw_rad=0.0)
+    true.K[:2, :2] = np.diag([100.0, 100.0])
+    drive, _ = loop_drive(true, 100, 140, 400.0, 0)
+    guess = GuessSettings(
+        frames=100, focal_px=(80.0, 95.0), pitch_deg=(11.0, 19.0),
+        steep_focal_px=(80.0, 104.0), steep_pitch_deg=(25.0, 32.0), steep_roll_deg=(-7.0, 0.0, 7.0),
+    )  # fmt: skip
+    camera, tried = coarse_camera(drive, PerceptionSettings(), guess, np.random.default_rng(0))
+    found = camera.mounting
+    assert any(c.roll_deg == 0.0 for c in tried) and max(c.fit for c in tried if c.pitch_deg > 24.0) > 0.15
+    assert abs(np.rad2deg(found.pitch_down_rad) - 33.0) < 4.0
+    assert abs(np.rad2deg(found.roll_rad) - roll_deg) < 4.0
+    assert abs(camera.K[0, 0] / 100.0 - 1.0) < 0.2
+
+
+def test_a_level_camera_costs_no_search_for_steep_ones():
+    true = fisheye(pitch_down_rad=np.deg2rad(16.0), roll_rad=0.0, yaw_rad=0.0)
+    drive, _ = loop_drive(true, 60, 100, 400.0, 0)
+    guess = GuessSettings(focal_px=(65.0, 80.0), pitch_deg=(16.0, 24.0), frames=100)
+    _, tried = coarse_camera(drive, PerceptionSettings(), guess, np.random.default_rng(0))
+    assert {c.roll_deg for c in tried} == {0.0} and len(tried) <= 13

@@ -59,7 +59,7 @@ def stacked(poses: list[LivePose]) -> np.ndarray:
 
 
 def scans_and_motion(drive: Drive):
-    limits = mapping_range(CAMERA.mounting.height_cm, SETTINGS.perception.range)
+    limits = mapping_range(CAMERA.mounting, SETTINGS.perception.range)
     edges = edges_of_drive(drive, SETTINGS.perception.edges, RoadTable(CAMERA, limits))
     commands = commands_of(drive, CAMERA.wheelbase_cm)
     motion = live_motion(commands, None, 1.0, CAMERA.mounting.height_cm)

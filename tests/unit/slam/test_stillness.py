@@ -97,6 +97,15 @@ def test_a_quick_turn_is_no_break():
     assert not put_elsewhere(pictures(place)).any()
 
 
+@pytest.mark.parametrize("contrast", [1.0, 0.5])
+def test_a_bare_picture_is_no_break(contrast):
+    place = np.concatenate([np.arange(80) * 0.5, 300.0 + np.arange(80) * 0.5])
+    small = pictures(place)
+    # What is seen before the jump is fainter than in most frames of the drive.
+    small[60:80] = 120.0 + contrast * (small[60:80] - 120.0)
+    assert put_elsewhere(small).any() == (contrast == 1.0)
+
+
 def test_few_frames_have_neither():
     for count in (1, 2, 5):
         small = pictures(np.arange(count) * 1.0)
