@@ -173,16 +173,18 @@ class RecordedJob:
         recording: The drive.
         data: Settings of the run.
         folder: Folder of the maps and labels of all recorded drives.
+        joined_in: Folder of joined maps, of which it is one that is listed by itself; else None.
     """
 
     recording: RecordedSettings
     data: DataSettings
     folder: Path
+    joined_in: Path | None = None
 
     @property
     def title(self) -> str:
         """Its name in messages."""
-        return str(self.recording.path)
+        return self.recording.name or str(self.recording.path)
 
     @property
     def name(self) -> str:
@@ -283,7 +285,7 @@ class RecordedJob:
         if settings.camera is not None and settings.camera.is_file():
             files.append(settings.camera)
         # What people say for others changes no label.
-        known = settings.model_dump(mode="json", exclude={"track", "licence", "car"})
+        known = settings.model_dump(mode="json", exclude={"name", "track", "licence", "car"})
         key = key_of(known, data.window, data.colour_weight, *map(fingerprint, files))
         folder = self.folder / "labels"
         is_whole = len(settings.parts) == 1

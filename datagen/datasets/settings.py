@@ -67,6 +67,7 @@ class RecordedSettings(Settings):
             for the validation and all earlier ones for learning; ``auto`` is ``lap`` where there are three
             complete laps, and else ``time``; ``train``, ``validation`` and ``test`` give all of it to that
             part, so that other drives must make up the others; ``none`` is the older word for ``train``.
+        name: Of the drive in messages; empty takes its path.
         track: Name of the track. Drives of one track are all in one part, see :mod:`datagen.datasets.leaks`;
             empty if that is not asked.
         licence, car: For the data sheet, beside the track: under what the recording may be used, and the name
@@ -89,6 +90,7 @@ class RecordedSettings(Settings):
     tape_width_cm: float | None = Field(default=None, gt=0.0)
     frames: tuple[int, int] | None = None
     split: Literal["time", "lap", "auto", "train", "validation", "test", "none"] = "time"
+    name: str = ""
     track: str = ""
     licence: str = ""
     car: str = ""
@@ -148,6 +150,9 @@ class DataSettings(Settings):
         synthetic: Synthetic drives.
         drives: Recorded drives.
         library: More recorded drives, of a library, split by their tracks.
+        known_drives: A library that is asked for recordings that are not where their maps say, so that they
+            cannot leak; None takes that of ``library``, else ``drives.sqlite`` of the current folder, if
+            there is one.
         map: Settings for mapping the synthetic drives.
         window: The bird's-eye window of the network: wide enough for the lane's lines on either side.
         colour_weight: Weight of colours beside brightness in the network's edges; maps use brightness alone.
@@ -157,6 +162,7 @@ class DataSettings(Settings):
     synthetic: SyntheticSettings = SyntheticSettings()
     drives: tuple[RecordedSettings, ...] = ()
     library: LibrarySettings | None = None
+    known_drives: Path | None = None
     map: MapSettings = MapSettings()
     window: BirdseyeWindow = BirdseyeWindow()
     colour_weight: float = Field(default=COLOUR_WEIGHT, ge=0.0, le=1.0)

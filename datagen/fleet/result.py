@@ -11,8 +11,9 @@ from datagen.fleet.work import LABELS_NAME, REFUSED, REJECTED
 from lanenet.data.files import json_text
 from lanenet.geometry.camera import Camera
 
+#: The list of a run's drives, beside the results.
 INDEX_NAME = "drives.json"
-_INDEX_FORMAT = "lanenet-fleet/1"
+INDEX_FORMAT = "lanenet-fleet/1"
 #: Of a drive that has no result: it failed; the run ended before it was begun; it is there twice.
 FAILED, LEFT, DUPLICATE = "failed", "left", "duplicate"
 
@@ -145,7 +146,7 @@ def write_index(result: FleetResult, storage: Storage) -> None:
 def _index(result: FleetResult) -> dict[str, Any]:
     joined = {name: f"{TRACKS}/{track.key}/{name}" for track in result.tracks for name in track.joined}
     return {
-        "format": _INDEX_FORMAT,
+        "format": INDEX_FORMAT,
         "drives": [
             {
                 **vars(found.drive),

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
@@ -11,43 +10,15 @@ from datagen.fleet.cars import find_cameras, with_camera, without_camera
 from datagen.fleet.engine import Engine
 from datagen.fleet.page import write_page
 from datagen.fleet.result import CarFound, FleetResult, Labelled, write_index
-from datagen.fleet.source import checksum, drive_files
 from datagen.fleet.stage import Finished, Progress, Stage
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import CAMERAS, LABELS, MAPS, TRACKS, FleetDrive, FleetSettings
 from datagen.fleet.tracks import join_tracks, named_tracks, recognised_tracks
 from datagen.fleet.work import REFUSED, REJECTED
-from datagen.made import key_of
-from lanenet.data.files import json_text
-from lanenet.errors import LanenetError
 from lanenet.outputs import lock_output
 
-#: The checksums of the drives' files, beside the results.
-CHECKSUMS_NAME = "checksums.json"
 #: Verdicts of maps, the best first.
 _GRADES = ("good", "usable", REJECTED, REFUSED)
-
-
-def with_checksums(drives: Iterable[FleetDrive], storage: Storage) -> list[FleetDrive]:
-    """Return the drives with the checksums of their files; without one if they are not there or unreadable.
-
-    Files that have the size and time of an earlier run are not read again.
-    """
-    known: dict[str, list[str]] = json.loads(storage.read(CHECKSUMS_NAME) or b"{}")
-    found: dict[str, list[str]] = {}
-    checked = []
-    for drive in drives:
-        before = known.get(drive.source, ["", ""])
-        try:
-            stamp = key_of(drive_files(drive.source))
-            found[drive.source] = before if before[0] == stamp else [stamp, checksum(drive.source)]
-        except (LanenetError, OSError):  # the run says why, and does the others
-            checked.append(replace(drive, checksum=""))
-            continue
-        checked.append(replace(drive, checksum=found[drive.source][1]))
-    if any(known.get(source) != pair for source, pair in found.items()):
-        storage.write(CHECKSUMS_NAME, json_text({**known, **found}).encode())
-    return checked
 
 
 def label_all(

@@ -118,8 +118,8 @@ def label_all(
     Drives of one car (of the library, or --car) share a camera that is found from them together, if theirs
     agree. Maps of one track (of the library, or --track) are joined.
     """
+    from datagen.fleet.checksums import with_checksums
     from datagen.fleet.run import label_all as run
-    from datagen.fleet.run import with_checksums
     from datagen.fleet.storage import Storage
     from datagen.fleet.task import FleetSettings
     from datagen.settings import MapSettings

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from fleet_drives import cut_tub, sixty_drives
 
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.local_engine import LocalEngine
 from datagen.fleet.ray_engine import RayEngine
-from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.run import label_all
 from datagen.fleet.stage import Counts
 from datagen.fleet.storage import RESULT_NAME, Storage
 from datagen.fleet.task import FleetDrive, FleetSettings

@@ -8,8 +8,9 @@ from typing import Any
 
 from fleet_work import HereEngine
 
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.result import FleetResult
-from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.run import label_all
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import FleetDrive, FleetSettings
 from datagen.settings import MapSettings

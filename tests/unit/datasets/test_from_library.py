@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 from recordings import lap, write_recording
 
-from datagen.datasets.build import check_leaks
+from datagen.datasets.build import check_leaks, recorded_jobs
 from datagen.datasets.from_library import _labelled, parts_of_tracks, with_library
 from datagen.datasets.settings import DataSettings, LibrarySettings
 from datagen.fleet.result import INDEX_NAME, FleetResult, Labelled, _index
+from datagen.fleet.source import checksum
 from datagen.fleet.task import FleetDrive
 from lanenet.data.files import write_json
 from lanenet.data.library import Library
@@ -67,7 +68,7 @@ def test_what_label_all_made_is_used_and_what_it_refused_is_left_out(
     library: Library, tmp_path: Path
 ) -> None:
     def labelled(name: str, verdict: str, reason: str = "") -> Labelled:
-        drive = FleetDrive(name, str(tmp_path / name), "", 40.0, None, None, None, None)
+        drive = FleetDrive(name, str(tmp_path / name), checksum(str(tmp_path / name)), 40.0)
         return Labelled(drive, verdict, reason, True, f"map-{name}", f"labels-{name}", {}, {})
 
     found = FleetResult(
@@ -84,6 +85,17 @@ def test_what_label_all_made_is_used_and_what_it_refused_is_left_out(
         tmp_path / "out" / "maps" / f"map-{name}" for name in ("a1", "b", "c")
     ]
     assert lines[0] == "left out: a2: stands still"
+    # Messages name drives as the library does, not by the keys of their maps.
+    assert [job.title for job in recorded_jobs(data, tmp_path / "work")] == ["a1", "b", "c"]
+    assert data.known_drives == library.path
+    # A drive that has other frames by now is not what was labelled.
+    image = next((tmp_path / "b").rglob("*.jpg"))
+    before = image.read_bytes()
+    image.write_bytes(before + b"more")
+    _, lines = _labelled(tmp_path / "out", {"b": tmp_path / "b", "c": tmp_path / "c"})
+    assert lines == ["left out: b: its files have changed since it was labelled; label it again"]
+    image.write_bytes(before)
+    assert _labelled(tmp_path / "out", {"b": tmp_path / "b"})[1] == []
     # Another drive that has the name of one by now, on another track, has no map yet.
     paths, lines = _labelled(tmp_path / "out", {"b": tmp_path / "b", "c": tmp_path / "new"})
     assert list(paths) == ["b"] and len(lines) == 1

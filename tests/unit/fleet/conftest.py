@@ -13,8 +13,9 @@ import pytest
 from fleet_runs import SETTINGS, drives_of
 
 from datagen.fleet import work
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.local_engine import LocalEngine
-from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.run import label_all
 from datagen.fleet.storage import Storage
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings

@@ -16,8 +16,9 @@ from fleet_runs import SETTINGS, copy_of, drives_of, labels_in, run
 from fleet_work import HereEngine
 
 from datagen.fleet import work
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.engine import Ended, Task
-from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.run import label_all
 from datagen.fleet.source import checksum
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import FleetSettings
@@ -230,7 +231,7 @@ def test_files_are_read_again_only_if_they_changed(
     drive, storage = copy_of(tiny, tmp_path / "tub"), Storage(str(tmp_path / "out"))
     read: list[str] = []
     monkeypatch.setattr(
-        "datagen.fleet.run.checksum", lambda source: (read.append(source), checksum(source))[1]
+        "datagen.fleet.checksums.checksum", lambda source: (read.append(source), checksum(source))[1]
     )
     (first,) = with_checksums(drives_of(drive), storage)
     assert with_checksums(drives_of(drive), storage) == [first] and read == [str(drive)]
