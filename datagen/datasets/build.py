@@ -53,6 +53,11 @@ class PreparedData:
         return [part.labels for part in self.of("train") for _ in range(part.counts_as)]
 
     @property
+    def weights(self) -> list[float]:
+        """How often each of :attr:`train` is shown beside the others."""
+        return [part.weight for part in self.of("train") for _ in range(part.counts_as)]
+
+    @property
     def validation(self) -> list[Path]:
         """Label sets to choose the epoch by."""
         return [part.labels for part in self.of("validation")]

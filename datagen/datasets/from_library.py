@@ -47,10 +47,12 @@ def with_library(data: DataSettings) -> tuple[DataSettings, list[str]]:
         paths, lines = _labelled(chosen.labelled, paths)
         entries = [entry for entry in entries if entry.name in paths]
     part_of = parts_of_tracks({entry.track for entry in entries}, chosen)
+    often = {"counts_as": chosen.counts_as, "weight": chosen.weight}
     drives = [
         _recorded(library, entry, paths[entry.name], part_of[entry.track], finished=bool(chosen.labelled))
         for entry in entries
     ]
+    drives = [drive.model_copy(update=often) for drive in drives]
     for role in ROLES:
         tracks = sorted(track for track, part in part_of.items() if part == role)
         count = sum(drive.split == role for drive in drives)

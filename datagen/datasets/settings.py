@@ -34,6 +34,7 @@ class SyntheticSettings(Settings):
             simulation's.
         may_fail: Up to this share of the mapped drives may be left out because their map is rejected or their
             road cannot be driven. Not every random road makes a good drive.
+        weight: How often their frames are shown beside those of recorded drives, as ``weight`` there.
         simulation: What all drives share; each gets its own ``seed``.
     """
 
@@ -44,6 +45,7 @@ class SyntheticSettings(Settings):
     variety: Literal["none", "roads", "all"] = "none"
     cameras: tuple[CameraSettings, ...] = ()
     may_fail: float = Field(default=0.0, ge=0.0, le=1.0)
+    weight: float = Field(default=1.0, gt=0.0, le=1000.0)
     simulation: SimulationSettings = SimulationSettings()
 
     @model_validator(mode="after")
@@ -79,6 +81,8 @@ class RecordedSettings(Settings):
         gap_cm: Distance left out between the parts, likewise; the longer of the two gaps counts.
         counts_as: Number of drives that this one counts as beside synthetic ones: its frames are shown that
             many times as often.
+        weight: How often it is shown beside others, in any ratio, and beside ``counts_as``: with 0.3, three
+            of ten times as often as one of weight 1. An epoch has as many samples as with equal weights.
         map: Settings for mapping this drive, unless it is a map.
     """
 
@@ -99,6 +103,7 @@ class RecordedSettings(Settings):
     gap_frames: int = Field(default=40, ge=0)
     gap_cm: float = Field(default=0.0, ge=0.0)
     counts_as: int = Field(default=1, ge=1, le=100)
+    weight: float = Field(default=1.0, gt=0.0, le=1000.0)
     map: MapSettings = MapSettings()
 
     @property
@@ -125,6 +130,7 @@ class LibrarySettings(Settings):
         validation_share: Share of the tracks to choose the epoch by, rounded up. Chosen, like the next.
         test_share: Share of the tracks to test on, likewise; the rest is learned from.
         validation_tracks, test_tracks: Tracks of these parts, instead of drawn ones.
+        counts_as, weight: Of each drive, see :class:`RecordedSettings`.
     """
 
     file: Path
@@ -134,6 +140,8 @@ class LibrarySettings(Settings):
     test_share: float = Field(default=0.2, gt=0.0, lt=1.0)
     validation_tracks: tuple[str, ...] = ()
     test_tracks: tuple[str, ...] = ()
+    counts_as: int = Field(default=1, ge=1, le=100)
+    weight: float = Field(default=1.0, gt=0.0, le=1000.0)
 
     @model_validator(mode="after")
     def _a_track_is_in_one_part(self) -> LibrarySettings:

@@ -227,6 +227,7 @@ def _recorded(job: RecordedJob, data: PreparedData) -> Sheet:
         "marking_cm": labels.meta.marking_cm,
         "split": chosen_split(labels, recording),
         "counts_as": recording.counts_as,
+        "weight": recording.weight,
         "parts": roles,
     }
     return facts | (dict.fromkeys(_MAPPED) if drive_map is None else _mapped(drive_map))

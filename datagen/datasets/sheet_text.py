@@ -99,7 +99,7 @@ def _recorded(facts: Mapping[str, Any]) -> str:
     items = [
         f"licence: {_known(facts['licence'])}; car: {_known(facts['car'])}; track: {_known(facts['track'])}",
         f"labels from its {facts['from']}, verdict {_known(facts['verdict'])}; split: {facts['split']}; "
-        f"counts as {counted(facts['counts_as'], 'drive')}",
+        f"counts as {counted(facts['counts_as'], 'drive')}, weight {facts.get('weight', 1.0):g}",
         f"road: {_known(facts['shape'])}{laps}; lines: {kinds}",
         f"lane width: {facts['lane_width_cm']:g} cm, as given; width of the tape: "
         f"{_number(facts['marking_cm'], 1)} cm",
