@@ -56,7 +56,8 @@ def with_library(data: DataSettings) -> tuple[DataSettings, list[str]]:
     for role in ROLES:
         tracks = sorted(track for track, part in part_of.items() if part == role)
         count = sum(drive.split == role for drive in drives)
-        lines.append(f"{role}: {counted(count, 'drive')} of the tracks {', '.join(tracks)}")
+        if count:
+            lines.append(f"{role}: {counted(count, 'drive')} of the tracks {', '.join(tracks)}")
     # Checked again, since a drive may be listed by hand, too.
     listed = {"library": None, "known_drives": chosen.file, "drives": (*data.drives, *drives)}
     return DataSettings(**{**dict(data), **listed}), lines
@@ -72,6 +73,8 @@ def parts_of_tracks(tracks: Iterable[str], settings: LibrarySettings) -> dict[st
         ConfigError: If a track that is to be in a part is not there, or a part would be empty.
     """
     known = set(tracks)
+    if settings.split != "track":
+        return dict.fromkeys(known, settings.split)
     named: dict[str, Role] = {
         **dict.fromkeys(settings.validation_tracks, "validation"),
         **dict.fromkeys(settings.test_tracks, "test"),

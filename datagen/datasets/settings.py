@@ -126,6 +126,8 @@ class LibrarySettings(Settings):
         file: The library (``lanenet drives``), relative to the folder in which the command runs.
         labelled: What ``lanenet label-all`` wrote: drives have their maps from there, and those that it
             refused are left out; None maps all drives.
+        split: ``track`` draws the part of each track; ``train``, ``validation`` and ``test`` give all drives
+            to that part, so that others, simulated ones for example, make up the rest.
         seed: Of the draw of the tracks.
         validation_share: Share of the tracks to choose the epoch by, rounded up. Chosen, like the next.
         test_share: Share of the tracks to test on, likewise; the rest is learned from.
@@ -135,6 +137,7 @@ class LibrarySettings(Settings):
 
     file: Path
     labelled: Path | None = None
+    split: Literal["track", "train", "validation", "test"] = "track"
     seed: int = Field(default=0, ge=0)
     validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     test_share: float = Field(default=0.2, gt=0.0, lt=1.0)

@@ -44,6 +44,9 @@ def test_all_drives_of_a_track_are_in_one_part(library: Library, tmp_path: Path)
         "c": ("validation", "club"),
     }
     assert {(drive.licence, drive.car) for drive in data.drives} == {("CC0-1.0", "red")}
+    whole, given = with_library(_data(library, split="train"))
+    assert {drive.split for drive in whole.drives} == {"train"}
+    assert given == ["train: 4 drives of the tracks club, hall, yard"]
     often, _ = with_library(_data(library, weight=0.3, counts_as=15))
     assert {(drive.weight, drive.counts_as) for drive in often.drives} == {(0.3, 15)}
     assert data.library is None and with_library(data) == (data, [])
