@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.fleet.engine import Engine, Task
-from datagen.fleet.memory import memory_bytes
+from datagen.fleet.memory import memory_together
 from datagen.fleet.meter import Meter
 from datagen.fleet.result import CarFound, Labelled
 from datagen.fleet.source import on_this_machine
@@ -85,7 +85,7 @@ def find_cameras(
     if jobs:
         # All drives are in memory together.
         tasks = [
-            Task(f"camera of {job.car}", job, sum(memory_bytes(drive.source) for drive, _ in job.drives))
+            Task(f"camera of {job.car}", job, memory_together(drive.source for drive, _ in job.drives))
             for job in jobs.values()
         ]
         places = list(jobs)

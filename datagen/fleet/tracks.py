@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from datagen.fleet.engine import Engine, Task
-from datagen.fleet.memory import memory_bytes
+from datagen.fleet.memory import memory_together
 from datagen.fleet.meter import Meter
 from datagen.fleet.result import Labelled, TrackFound
 from datagen.fleet.source import on_this_machine
@@ -176,8 +176,7 @@ def join_tracks(
     if missing:
         # All drives are in memory together.
         tasks = [
-            Task(job.track, job, sum(memory_bytes(drive.source) for drive, _ in job.drives))
-            for job in missing
+            Task(job.track, job, memory_together(drive.source for drive, _ in job.drives)) for job in missing
         ]
         with closing(engine.run(join_drives, tasks)) as running:
             for end in running:
