@@ -6,6 +6,7 @@ import errno
 import platform
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -134,13 +135,19 @@ def _label_drive(job: Job) -> Outcome:
 
 def _map(job: Job, path: Path, folder: Path) -> dict[str, Any]:
     """Map a drive into a folder; returns what its marker says."""
+    with ExitStack() as stack:
+        camera = job.drive.camera
+        here = None if camera is None else stack.enter_context(on_this_machine(camera))
+        return _map_with(job, path, folder, here)
+
+
+def _map_with(job: Job, path: Path, folder: Path, camera: Path | None) -> dict[str, Any]:
     drive, settings = job.drive, job.settings
     meter, found = Meter(), {"verdict": REFUSED, "reason": "", "reasons": [], "frames": 0, "driven_s": 0.0}
     try:
         recording = open_drive(path)
         found |= {"frames": len(recording), "driven_s": round(driven_s(recording), 3)}
         found |= {"width": recording.width, "height": recording.height}
-        camera = None if drive.camera is None else local_path(drive.camera)
         request = MapRequest(
             path,
             drive.lane_width_cm,

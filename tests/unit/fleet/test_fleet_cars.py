@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import uuid
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import pytest
 from fleet_runs import copy_of, drives_of, run
 
@@ -129,6 +131,23 @@ def test_a_given_camera_stays_and_an_open_drive_gets_the_cars(tiny: Path, tmp_pa
     assert set(result.cars[0].from_drives) == {"a", "b"}
     assert result.cars[0].own == {"given": "has a camera of its own"}
     assert [drive.drive.camera is None for drive in result.drives] == [False, False, True, False]
+
+
+def test_a_camera_in_an_object_store_is_used_from_there(tiny: Path, by_car: list[str]):
+    url, memory = f"memory://{uuid.uuid4().hex}", fsspec.filesystem("memory")
+    for name in ("a", "b"):
+        memory.put(str(tiny), f"{url}/drives/{name}", recursive=True)
+        memory.pipe_file(f"{url}/drives/{name}/note.txt", name.encode())
+    drives = [replace(drive, car="red") for drive in drives_of(f"{url}/drives/a", f"{url}/drives/b")]
+    result, names = run(f"{url}/out", drives)
+    assert names == ["a", "b", "camera of red", "a", "b"]
+    camera = result.cars[0].camera
+    assert camera is not None and result.cars[0].own == {}
+    for found in result.drives:
+        kept = memory.cat_file(f"{url}/out/maps/{found.map_key}/camera.yaml").decode()
+        assert f"yaw_rad: {camera.mounting.yaw_rad}" in kept and found.verdict == "good"
+    assert run(f"{url}/out", drives)[1] == []
+    memory.rm(url, recursive=True)
 
 
 def test_without_two_drives_that_agree_there_is_no_camera_for_all(
