@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from datagen.lanes.scale import measure_lane
 from datagen.slam.camera.coarse import with_known_scale
-from datagen.tracks.cameras import DriveCamera, difference, same_lens
+from datagen.tracks.cameras import MOST_SIGMAS, DriveCamera, difference, same_lens, sigmas_apart
 from datagen.tracks.shape import Similarity
 from datagen.tracks.together import Together, solve_together
 from datagen.tracks.visit import Visit
@@ -64,27 +65,38 @@ def agreeing_drives(cameras: Sequence[DriveCamera]) -> tuple[list[int], list[Odd
         The places of the agreeing ones, those that know the focal length best first; and the others.
     """
     order = sorted(range(len(cameras)), key=lambda k: (cameras[k].sigma.get("focal", 0.0), k))
+
+    @cache
+    def agree(a: int, b: int) -> bool:
+        return _may_be_one(cameras[a], cameras[b])
+
     best: list[int] = []
     for first in order:
         group = [first]
         for k in order:
-            if k != first and not any(_unlike(cameras[k], cameras[other]) for other in group):
+            if k != first and all(agree(min(k, other), max(k, other)) for other in group):
                 group.append(k)
         if len(group) > len(best):
             best = sorted(group, key=order.index)
+        if len(best) == len(cameras):
+            break
     odd = []
     for place in sorted(set(order) - set(best)):
-        than, text = next((k, text) for k in best if (text := _unlike(cameras[place], cameras[k])))
-        odd.append(Odd(place, than, text))
+        than = next(k for k in best if not agree(min(place, k), max(place, k)))
+        odd.append(Odd(place, than, _unlike(cameras[place], cameras[than])))
     return best, odd
 
 
+def _may_be_one(one: DriveCamera, other: DriveCamera) -> bool:
+    """Tell whether two cameras may be one; cheap, since all pairs of a car's drives are compared."""
+    return same_lens([one, other]) and max(map(abs, sigmas_apart(one, other).values())) <= MOST_SIGMAS
+
+
 def _unlike(one: DriveCamera, other: DriveCamera) -> str:
-    """Say how two cameras differ; nothing where they may be one."""
+    """Say how two cameras differ."""
     if not same_lens([one, other]):
         return "images of another size or lens"
-    found = difference(other, one)
-    return "" if found.agree else found.text
+    return difference(other, one).text
 
 
 def camera_of_car(visits: Sequence[Visit], rng: np.random.Generator) -> CarCamera:
