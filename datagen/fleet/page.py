@@ -29,6 +29,7 @@ _VERDICTS = {
     LEFT: "left",
     DUPLICATE: "given twice",
 }
+_NOT_COUNTED = " Cameras of cars, the maps that they were found from, and joined maps are not counted."
 #: Maps that are shown of each verdict, and their longer side, [px]; lines of a list. Chosen: a map takes
 #: about 10 kB, so a page has 6 MB at most.
 _MOST_MAPS, _MAP_PX, _MOST_LINES = 150, 240, 200
@@ -76,6 +77,7 @@ def fleet_page(result: FleetResult, thumbnails: Mapping[str, bytes]) -> str:
         note(
             "Of all results that these drives have, whichever run made them; one thread each. Memory is the "
             "most that a process had in RAM. Storage counts maps and labels with their pictures."
+            + (_NOT_COUNTED if result.cars or result.tracks else "")
         ),
         details("By machine", table(_machine_rows(result.drives))),
     ]
