@@ -58,8 +58,9 @@ def machines(monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoMachines]:
 def contents(out: Path) -> dict[str, bytes]:
     """Return what was made, by path; not the markers, which tell when and where."""
     files = [path for kind in KINDS for path in (out / kind).rglob("*") if path.is_file()]
-    # Joined maps name those that they were made from by their place.
-    other = (RESULT_NAME, "joined.yaml")
+    # Joined maps name those that they were made from by their place, and the marker of a map the file of its
+    # camera by place and time.
+    other = (RESULT_NAME, "joined.yaml", "map.done.json")
     return {str(path.relative_to(out)): path.read_bytes() for path in files if path.name not in other}
 
 
