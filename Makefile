@@ -21,10 +21,11 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
+	@echo "make general      the network for any car: simulated drives, and real ones of LIBRARY=drives.sqlite; hours"
 	@echo "make install      environment for mapping and training in $(VENV)"
 	@echo "make test         environment for developers, then the fast tests"
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
@@ -54,6 +55,14 @@ help:
 
 train: $(VENV)/.stamp-train
 	$(BIN)/lanenet train $(CONFIG)
+
+# Real drives are those of a library (lanenet drives), with the maps of lanenet label-all where LABELLED says so; all
+# of a track in one part. GENERAL adds arguments, such as data.library.weight=0.3 or data.library.split=train.
+LIBRARY ?=
+LABELLED ?=
+general: $(VENV)/.stamp-train
+	$(BIN)/lanenet train configs/general.yaml $(if $(LIBRARY),name=general-real data.library.file=$(LIBRARY)) \
+	  $(if $(LABELLED),data.library.labelled=$(LABELLED)) $(GENERAL)
 
 install: $(VENV)/.stamp-train
 

@@ -1,6 +1,6 @@
 """Write the data sheet of a network that an earlier version trained, from what its checkpoint recorded.
 
-    python contrib/data_sheet.py checkpoints/general
+    python contrib/data_sheet.py checkpoints/general --added 0b26523b02ab
 
 ``lanenet train`` writes the sheet itself, from the label sets. Where these are gone, the checkpoint has
 its ``run.yaml``, ``metrics.json``, ``results.json`` and model card. The settings of its simulated drives
@@ -36,12 +36,17 @@ _NOTE = """## How this sheet was made
 
 Afterwards, by `contrib/data_sheet.py`: the network is older than data sheets. Its simulated drives were
 drawn again from `run.yaml`; the camera of the first test drive is that of `camera.yaml`, to the last digit.
-Numbers of frames and drives are those of `metrics.json`, `results.json` and the model card. Which of the
-drives that were asked for gave no labels was not kept."""
+Numbers of frames and drives are those of `metrics.json`, `results.json` and the model card; minutes are
+those frames at {rate_hz:g} a second. Which of the drives that were asked for gave no labels was not kept, nor
+how far they went, nor the commit that it was trained with; {came}."""
 
 
-def sheet_of_checkpoint(folder: Path) -> Sheet:
+def sheet_of_checkpoint(folder: Path, added: str | None = None) -> Sheet:
     """Return the sheet of a checkpoint that learned from simulated drives alone.
+
+    Args:
+        folder: The checkpoint.
+        added: Commit that brought its weights as they are into the repository; None if it is not known.
 
     Raises:
         CheckpointError: If it learned from recorded ones, or this version would draw other drives.
@@ -60,17 +65,24 @@ def sheet_of_checkpoint(folder: Path) -> Sheet:
     frames["test"] = sum(source["frames"] for source in results["sources"])
     jobs = draw_jobs(run.data, "train", Path())
     unknown = {"left_out": None, "made": made}
+    rate_hz = run.data.synthetic.simulation.rate_hz
+    came = f"its weights came with commit {added}" if added else "nor which one brought its weights"
     return {
         "format": FORMAT,
         "name": run.name,
         "made_by": {"lanenet": metrics["versions"]["lanenet"], "commit": None},
         "parts": {
-            role: {"drives": made[role], "frames": frames[role], "minutes": None, "km": None}
+            role: {
+                "drives": made[role],
+                "frames": frames[role],
+                "minutes": frames[role] / rate_hz / 60.0,
+                "km": None,
+            }
             for role in ROLES
         },
         "simulated": simulated_facts(run.data, jobs, "asked for") | unknown,
         "recorded": [],
-        "notes": [_NOTE],
+        "notes": [_NOTE.format(rate_hz=rate_hz, came=came)],
     }
 
 
@@ -93,8 +105,10 @@ def main() -> None:
     """Write the two files."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
-    folder = parser.parse_args().checkpoint
-    for name, text in sheet_files(sheet_of_checkpoint(folder)).items():
+    parser.add_argument("--added", help="Commit that brought its weights as they are into the repository.")
+    told = parser.parse_args()
+    folder = told.checkpoint
+    for name, text in sheet_files(sheet_of_checkpoint(folder, told.added)).items():
         write_text(folder / name, text)
         sys.stdout.write(f"wrote {folder / name}\n")
 

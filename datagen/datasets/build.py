@@ -21,7 +21,8 @@ from datagen.datasets.jobs import (
 )
 from datagen.datasets.leaks import refuse_leaks
 from datagen.datasets.settings import ROLES, DataSettings, Role
-from lanenet.data.maps.joined import maps_in
+from lanenet.data.library import DEFAULT_LIBRARY
+from lanenet.data.maps.joined import is_joined, maps_in
 from lanenet.errors import ConfigError, TrackingLostError
 from lanenet.processes import Progress, run_jobs
 
@@ -50,6 +51,11 @@ class PreparedData:
     def train(self) -> list[Path]:
         """Label sets to learn from; a recording that counts as several drives is listed as often."""
         return [part.labels for part in self.of("train") for _ in range(part.counts_as)]
+
+    @property
+    def weights(self) -> list[float]:
+        """How often each of :attr:`train` is shown beside the others."""
+        return [part.weight for part in self.of("train") for _ in range(part.counts_as)]
 
     @property
     def validation(self) -> list[Path]:
@@ -130,10 +136,22 @@ def recorded_jobs(settings: DataSettings, work_dir: Path) -> list[RecordedJob]:
 
     Joined maps have a job for each of their drives.
     """
-    drives = [
-        drive.model_copy(update={"path": path}) for drive in settings.drives for path in maps_in(drive.path)
-    ]
-    return [RecordedJob(drive, settings, work_dir / "drives") for drive in drives]
+    jobs = []
+    for drive in settings.drives:
+        paths = maps_in(drive.path)
+        for path in paths:
+            # Those of a folder that is listed as a whole have its title, each with its own name.
+            name = f"{drive.name}/{path.name}" if drive.name and len(paths) > 1 else drive.name
+            one = drive.model_copy(update={"path": path, "name": name})
+            alone = _joined_in(path) if paths == [drive.path] else None
+            jobs.append(RecordedJob(one, settings, work_dir / "drives", alone))
+    return jobs
+
+
+def _joined_in(path: Path) -> Path | None:
+    """Return the folder of joined maps that a map lies in; None if it lies in none."""
+    folder = path.resolve().parent
+    return folder if is_joined(folder) and path.resolve() in maps_in(folder) else None
 
 
 def check_leaks(
@@ -152,7 +170,9 @@ def check_leaks(
     Raises:
         LanenetError: As :func:`datagen.datasets.leaks.refuse_leaks`.
     """
-    return refuse_leaks(recorded_jobs(settings, work_dir), work_dir / "drives" / "leaks", progress)
+    library = settings.known_drives or (DEFAULT_LIBRARY if DEFAULT_LIBRARY.is_file() else None)
+    folder = work_dir / "drives" / "leaks"
+    return refuse_leaks(recorded_jobs(settings, work_dir), folder, progress, library)
 
 
 def shared_camera(settings: DataSettings, jobs: Sequence[Job]) -> Path | None:

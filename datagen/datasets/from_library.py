@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from datagen.datasets.settings import ROLES, DataSettings, LibrarySettings, RecordedSettings, Role
+from datagen.fleet.checksums import checksums_now
+from datagen.fleet.result import INDEX_FORMAT, INDEX_NAME
+from datagen.fleet.storage import Storage
 from lanenet.data.library import Entry, Library
 from lanenet.errors import ConfigError, counted
 from lanenet.reading import read_json
 
-#: What ``lanenet label-all`` writes beside its results (:mod:`datagen.fleet.run`).
-_INDEX_NAME, _INDEX_FORMAT = "drives.json", "lanenet-fleet/1"
 #: Names in a message; chosen.
 _MOST_NAMED = 5
 
@@ -46,16 +47,20 @@ def with_library(data: DataSettings) -> tuple[DataSettings, list[str]]:
         paths, lines = _labelled(chosen.labelled, paths)
         entries = [entry for entry in entries if entry.name in paths]
     part_of = parts_of_tracks({entry.track for entry in entries}, chosen)
+    often = {"counts_as": chosen.counts_as, "weight": chosen.weight}
     drives = [
         _recorded(library, entry, paths[entry.name], part_of[entry.track], finished=bool(chosen.labelled))
         for entry in entries
     ]
+    drives = [drive.model_copy(update=often) for drive in drives]
     for role in ROLES:
         tracks = sorted(track for track, part in part_of.items() if part == role)
         count = sum(drive.split == role for drive in drives)
-        lines.append(f"{role}: {counted(count, 'drive')} of the tracks {', '.join(tracks)}")
+        if count:
+            lines.append(f"{role}: {counted(count, 'drive')} of the tracks {', '.join(tracks)}")
     # Checked again, since a drive may be listed by hand, too.
-    return DataSettings(**{**dict(data), "library": None, "drives": (*data.drives, *drives)}), lines
+    listed = {"library": None, "known_drives": chosen.file, "drives": (*data.drives, *drives)}
+    return DataSettings(**{**dict(data), **listed}), lines
 
 
 def parts_of_tracks(tracks: Iterable[str], settings: LibrarySettings) -> dict[str, Role]:
@@ -68,6 +73,8 @@ def parts_of_tracks(tracks: Iterable[str], settings: LibrarySettings) -> dict[st
         ConfigError: If a track that is to be in a part is not there, or a part would be empty.
     """
     known = set(tracks)
+    if settings.split != "track":
+        return dict.fromkeys(known, settings.split)
     named: dict[str, Role] = {
         **dict.fromkeys(settings.validation_tracks, "validation"),
         **dict.fromkeys(settings.test_tracks, "test"),
@@ -112,6 +119,7 @@ def _recorded(library: Library, entry: Entry, path: Path, part: Role, *, finishe
             "lane_width_cm": entry.lane_width_cm,
             "camera": camera if camera is not None and camera.exists() else None,
             "split": part,
+            "name": entry.name,
             "track": entry.track,
             "licence": entry.licence,
             "car": entry.car,
@@ -129,10 +137,11 @@ def _labelled(folder: Path, sources: dict[str, Path]) -> tuple[dict[str, Path], 
     Raises:
         ConfigError: If the folder is not one of ``label-all``.
     """
-    index: Any = read_json(folder / _INDEX_NAME, ConfigError)
-    if not isinstance(index, dict) or index.get("format") != _INDEX_FORMAT:
-        raise ConfigError(f"{folder / _INDEX_NAME}: expected what lanenet label-all writes ({_INDEX_FORMAT})")
+    index: Any = read_json(folder / INDEX_NAME, ConfigError)
+    if not isinstance(index, dict) or index.get("format") != INDEX_FORMAT:
+        raise ConfigError(f"{folder / INDEX_NAME}: expected what lanenet label-all writes ({INDEX_FORMAT})")
     made = {drive["name"]: drive for drive in index["drives"]}
+    now = checksums_now([str(source.resolve()) for source in sources.values()], Storage(str(folder)))
     paths, lines = dict[str, Path](), list[str]()
     for name, source in sources.items():
         found = made.get(name)
@@ -142,6 +151,8 @@ def _labelled(folder: Path, sources: dict[str, Path]) -> tuple[dict[str, Path], 
             lines.append(
                 f"left out: {name}: labelled from {found['source']}, but is {source}; label it again"
             )
+        elif now.get(found["source"], found["checksum"]) != found["checksum"]:
+            lines.append(f"left out: {name}: its files have changed since it was labelled; label it again")
         elif not found["labels"]:
             lines.append(f"left out: {name}: {found['reason']}")
         else:

@@ -42,12 +42,14 @@ class Part:
         labels: Its file.
         frames: The simulated drive whose truth it holds, or the map that it was made from.
         counts_as: Number of training drives that this set counts as.
+        weight: How often it is shown beside others.
     """
 
     role: Role
     labels: Path
     frames: Path
     counts_as: int = 1
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ class SyntheticJob:
             write_text(failure.path, str(error))
             failure.mark()
             return LeftOut(str(error))
-        return (Part(self.role, self.labels, self.frames),)
+        return (Part(self.role, self.labels, self.frames, weight=self.data.synthetic.weight),)
 
     def _make_labels(self) -> None:
         data, mapping, track = self.data, self._map_settings, self.simulation.track
@@ -173,16 +175,18 @@ class RecordedJob:
         recording: The drive.
         data: Settings of the run.
         folder: Folder of the maps and labels of all recorded drives.
+        joined_in: Folder of joined maps, of which it is one that is listed by itself; else None.
     """
 
     recording: RecordedSettings
     data: DataSettings
     folder: Path
+    joined_in: Path | None = None
 
     @property
     def title(self) -> str:
         """Its name in messages."""
-        return str(self.recording.path)
+        return self.recording.name or str(self.recording.path)
 
     @property
     def name(self) -> str:
@@ -282,8 +286,8 @@ class RecordedJob:
         files = [settings.path]
         if settings.camera is not None and settings.camera.is_file():
             files.append(settings.camera)
-        # What people say for others changes no label.
-        known = settings.model_dump(mode="json", exclude={"track", "licence", "car"})
+        # What people say for others changes no label, nor does how often it is shown.
+        known = settings.model_dump(mode="json", exclude={"name", "track", "licence", "car", "weight"})
         key = key_of(known, data.window, data.colour_weight, *map(fingerprint, files))
         folder = self.folder / "labels"
         is_whole = len(settings.parts) == 1
@@ -293,6 +297,7 @@ class RecordedJob:
                 self.whole if is_whole else folder / f"{self.name}.{role}.parquet",
                 self.frames,
                 settings.counts_as if role == "train" else 1,
+                settings.weight,
             )
             for role in settings.parts
         )

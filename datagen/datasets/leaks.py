@@ -22,6 +22,7 @@ from lanenet.config import read_yaml
 from lanenet.data.drives import open_drive
 from lanenet.data.files import write_bytes, write_text
 from lanenet.data.label_set import LabelSet, read_labels
+from lanenet.data.library import Library
 from lanenet.data.library.fingerprint import HASH_BYTES, Fingerprint, take_fingerprint
 from lanenet.data.library.overlap import Recording, find_overlaps
 from lanenet.data.library.relation import relation_sentence
@@ -48,8 +49,42 @@ class _Entry:
     of_images: bool
 
 
+@dataclass(frozen=True)
+class _Source:
+    """Where a recording of a run can be known from.
+
+    Attributes:
+        job: Its job.
+        path: The recording; None for a label set, which names none.
+        remembered: What a library remembers of a recording that is not there any more.
+    """
+
+    job: RecordedJob
+    path: Path | None
+    remembered: Fingerprint | None = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether nothing is known of it."""
+        return self.path is not None and self.remembered is None and not self.path.exists()
+
+    @property
+    def key(self) -> list[object]:
+        """What changes when what is known of it does."""
+        recording = self.job.recording
+        known = [fingerprint(recording.path)]
+        if self.remembered is not None:
+            known.append(hashlib.sha256(self.remembered.to_bytes()).hexdigest())
+        elif self.path is not None:
+            known.append(fingerprint(self.path))
+        return [str(recording.path.resolve()), recording.parts, recording.frames, *known]
+
+
 def refuse_leaks(
-    jobs: Sequence[RecordedJob], folder: Path, progress: Progress | None = None
+    jobs: Sequence[RecordedJob],
+    folder: Path,
+    progress: Progress | None = None,
+    library: Path | None = None,
 ) -> tuple[str, ...]:
     """Refuse drives of which one is learned from and another, of the same recording or track, judged by.
 
@@ -59,36 +94,31 @@ def refuse_leaks(
         jobs: The recorded drives of a run.
         folder: Keeps fingerprints and the answer.
         progress: Called with (stage, done, total).
+        library: Asked for recordings that are not where their maps say; None asks none.
 
     Returns:
         What could not be checked, for people.
 
     Raises:
         ConfigError: Names both drives, and the frames or the track that they share.
-        LanenetError: If a drive, a map or a label set cannot be read.
+        LanenetError: If a drive, a map, a label set or the library cannot be read.
     """
-    _refuse_shared_tracks([job.recording for job in jobs])
+    _refuse_shared_tracks(jobs)
     sources = [
-        (job, _drive_behind(job))
+        _source(job, library)
         for job in jobs
         if any(other is not job and _may_leak(job.recording, other.recording) for other in jobs)
     ]
     unknown = tuple(
-        f"{job.title}: its recording {drive} is not here: nobody can say whether other drives share frames "
-        "with it"
-        for job, drive in sources
-        if drive is not None and not drive.exists()
+        f"{source.job.title}: its recording {source.path} is not here: nobody can say whether other drives "
+        "share frames with it"
+        for source in sources
+        if source.lost
     )
-    if len(sources) - len(unknown) < 2:
+    there = [source for source in sources if not source.lost]
+    if len(there) < 2:
         return unknown
-    there = [(job, drive) for job, drive in sources if drive is None or drive.exists()]
-    key = key_of(
-        [
-            [str(job.recording.path.resolve()), job.recording.parts, job.recording.frames]
-            + [fingerprint(path) for path in (job.recording.path, drive) if path is not None]
-            for job, drive in there
-        ]
-    )
+    key = key_of([source.key for source in there])
     make_folder(folder)
     answer = Output(folder / "leaks.txt", key)
     if not answer.done:
@@ -110,20 +140,28 @@ def refuse_leaks(
     return (*answer.path.read_text(encoding="utf-8").splitlines(), *unknown)
 
 
-def _refuse_shared_tracks(drives: Sequence[RecordedSettings]) -> None:
-    """Refuse drives of one track in different parts.
+def _refuse_shared_tracks(jobs: Sequence[RecordedJob]) -> None:
+    """Refuse drives of one track in different parts: one of a name, or one whose maps were joined.
 
     Two drives that are each split by their time are refused, too: the one's test would be on a road that the
-    other has learned. Who wants that names no track.
+    other has learned. Who wants that names no track, and lists joined maps by their folder.
     """
-    for one, other in itertools.combinations(drives, 2):
-        if one.track and one.track == other.track and _may_leak(one, other):
-            parts = ["/".join(drive.parts) for drive in (one, other)]
-            raise ConfigError(
-                f"data.drives: {one.path} ({parts[0]}) and {other.path} ({parts[1]}) are both of the track "
-                f"{one.track!r}, which may be in one part only; give both whole to one part (split: train, "
-                "validation or test), or leave out 'track' where a road that was learned may be tested on"
-            )
+    for first, second in itertools.combinations(jobs, 2):
+        one, other = first.recording, second.recording
+        if not _may_leak(one, other):
+            continue
+        if one.track and one.track == other.track:
+            shared, instead = f"of the track {one.track!r}", "leave out 'track'"
+        elif first.joined_in is not None and first.joined_in == second.joined_in:
+            shared, instead = f"joined in {first.joined_in}", "list that folder"
+        else:
+            continue
+        parts = ["/".join(drive.parts) for drive in (one, other)]
+        raise ConfigError(
+            f"data.drives: {first.title} ({parts[0]}) and {second.title} ({parts[1]}) are both {shared}, and "
+            "a track may be in one part only; give both whole to one part (split: train, validation or "
+            f"test), or {instead} where a road that was learned may be tested on"
+        )
 
 
 def _may_leak(one: RecordedSettings, other: RecordedSettings) -> bool:
@@ -138,16 +176,25 @@ def _drive_behind(job: RecordedJob) -> Path | None:
     return Path(read_yaml(job.recording.path / "map.yaml")["drive"]) if job.is_map else job.recording.path
 
 
-def _known(
-    sources: Sequence[tuple[RecordedJob, Path | None]], folder: Path, progress: Progress | None
-) -> list[_Entry]:
+def _source(job: RecordedJob, library: Path | None) -> _Source:
+    path = _drive_behind(job)
+    if path is None or path.exists() or library is None:
+        return _Source(job, path)
+    known = Library.open(library)
+    entries = known.entries()
+    entry = next((entry for entry in entries if entry.name == job.recording.name), None) or known.find(path)
+    return _Source(job, path, None if entry is None else known.recording(entry.name).fingerprint)
+
+
+def _known(sources: Sequence[_Source], folder: Path, progress: Progress | None) -> list[_Entry]:
     entries = []
-    for number, (job, path) in enumerate(sources):
-        if path is None:
+    for number, source in enumerate(sources):
+        job = source.job
+        if source.path is None:
             known = _of_labels(read_labels(job.recording.path))
         else:
-            known = _used(job, _taken(path, folder))
-        entries.append(_Entry(job, Recording(job.title, known, job.recording.track), path is not None))
+            known = _used(job, source.remembered or _taken(source.path, folder))
+        entries.append(_Entry(job, Recording(job.title, known, job.recording.track), source.path is not None))
         if progress is not None:
             progress("read", number + 1, len(sources))
     return entries

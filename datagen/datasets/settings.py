@@ -34,6 +34,7 @@ class SyntheticSettings(Settings):
             simulation's.
         may_fail: Up to this share of the mapped drives may be left out because their map is rejected or their
             road cannot be driven. Not every random road makes a good drive.
+        weight: How often their frames are shown beside those of recorded drives, as ``weight`` there.
         simulation: What all drives share; each gets its own ``seed``.
     """
 
@@ -44,6 +45,7 @@ class SyntheticSettings(Settings):
     variety: Literal["none", "roads", "all"] = "none"
     cameras: tuple[CameraSettings, ...] = ()
     may_fail: float = Field(default=0.0, ge=0.0, le=1.0)
+    weight: float = Field(default=1.0, gt=0.0, le=1000.0)
     simulation: SimulationSettings = SimulationSettings()
 
     @model_validator(mode="after")
@@ -67,6 +69,7 @@ class RecordedSettings(Settings):
             for the validation and all earlier ones for learning; ``auto`` is ``lap`` where there are three
             complete laps, and else ``time``; ``train``, ``validation`` and ``test`` give all of it to that
             part, so that other drives must make up the others; ``none`` is the older word for ``train``.
+        name: Of the drive in messages; empty takes its path.
         track: Name of the track. Drives of one track are all in one part, see :mod:`datagen.datasets.leaks`;
             empty if that is not asked.
         licence, car: For the data sheet, beside the track: under what the recording may be used, and the name
@@ -78,6 +81,8 @@ class RecordedSettings(Settings):
         gap_cm: Distance left out between the parts, likewise; the longer of the two gaps counts.
         counts_as: Number of drives that this one counts as beside synthetic ones: its frames are shown that
             many times as often.
+        weight: How often it is shown beside others, in any ratio, and beside ``counts_as``: with 0.3, three
+            of ten times as often as one of weight 1. An epoch has as many samples as with equal weights.
         map: Settings for mapping this drive, unless it is a map.
     """
 
@@ -89,6 +94,7 @@ class RecordedSettings(Settings):
     tape_width_cm: float | None = Field(default=None, gt=0.0)
     frames: tuple[int, int] | None = None
     split: Literal["time", "lap", "auto", "train", "validation", "test", "none"] = "time"
+    name: str = ""
     track: str = ""
     licence: str = ""
     car: str = ""
@@ -97,6 +103,7 @@ class RecordedSettings(Settings):
     gap_frames: int = Field(default=40, ge=0)
     gap_cm: float = Field(default=0.0, ge=0.0)
     counts_as: int = Field(default=1, ge=1, le=100)
+    weight: float = Field(default=1.0, gt=0.0, le=1000.0)
     map: MapSettings = MapSettings()
 
     @property
@@ -119,19 +126,25 @@ class LibrarySettings(Settings):
         file: The library (``lanenet drives``), relative to the folder in which the command runs.
         labelled: What ``lanenet label-all`` wrote: drives have their maps from there, and those that it
             refused are left out; None maps all drives.
+        split: ``track`` draws the part of each track; ``train``, ``validation`` and ``test`` give all drives
+            to that part, so that others, simulated ones for example, make up the rest.
         seed: Of the draw of the tracks.
         validation_share: Share of the tracks to choose the epoch by, rounded up. Chosen, like the next.
         test_share: Share of the tracks to test on, likewise; the rest is learned from.
         validation_tracks, test_tracks: Tracks of these parts, instead of drawn ones.
+        counts_as, weight: Of each drive, see :class:`RecordedSettings`.
     """
 
     file: Path
     labelled: Path | None = None
+    split: Literal["track", "train", "validation", "test"] = "track"
     seed: int = Field(default=0, ge=0)
     validation_share: float = Field(default=0.15, gt=0.0, lt=1.0)
     test_share: float = Field(default=0.2, gt=0.0, lt=1.0)
     validation_tracks: tuple[str, ...] = ()
     test_tracks: tuple[str, ...] = ()
+    counts_as: int = Field(default=1, ge=1, le=100)
+    weight: float = Field(default=1.0, gt=0.0, le=1000.0)
 
     @model_validator(mode="after")
     def _a_track_is_in_one_part(self) -> LibrarySettings:
@@ -148,6 +161,9 @@ class DataSettings(Settings):
         synthetic: Synthetic drives.
         drives: Recorded drives.
         library: More recorded drives, of a library, split by their tracks.
+        known_drives: A library that is asked for recordings that are not where their maps say, so that they
+            cannot leak; None takes that of ``library``, else ``drives.sqlite`` of the current folder, if
+            there is one.
         map: Settings for mapping the synthetic drives.
         window: The bird's-eye window of the network: wide enough for the lane's lines on either side.
         colour_weight: Weight of colours beside brightness in the network's edges; maps use brightness alone.
@@ -157,6 +173,7 @@ class DataSettings(Settings):
     synthetic: SyntheticSettings = SyntheticSettings()
     drives: tuple[RecordedSettings, ...] = ()
     library: LibrarySettings | None = None
+    known_drives: Path | None = None
     map: MapSettings = MapSettings()
     window: BirdseyeWindow = BirdseyeWindow()
     colour_weight: float = Field(default=COLOUR_WEIGHT, ge=0.0, le=1.0)

@@ -66,14 +66,29 @@ def data_sheet(
         }
         simulated = simulated_facts(settings, [job for job in drawn if job.labels in there], "made")
         simulated |= {"made": made, "left_out": left_out_reasons(data.left_out)}
+    recorded = [_recorded(job, data) for job in jobs]
     return {
         "format": FORMAT,
         "name": name,
         "made_by": {"lanenet": metadata.version("lanenet"), "commit": commit_of_this_code()},
         "parts": {role: _total(extents) for role, extents in parts.items()},
         "simulated": simulated,
-        "recorded": [_recorded(job, data) for job in jobs],
+        "recorded": recorded,
+        "licences": licences(recorded),
     }
+
+
+def licences(recorded: Iterable[Sheet]) -> dict[str, Sheet]:
+    """Sum up recorded drives by their licences; those of drives that say none are under "".
+
+    Args:
+        recorded: What the sheet says of each drive.
+    """
+    found: dict[str, list[Mapping[str, int | float]]] = {}
+    for drive in recorded:
+        extents = list(drive["parts"].values())
+        found.setdefault(drive["licence"] or "", []).append(_total(extents) | {"drives": 1})
+    return {licence: _total(extents) for licence, extents in sorted(found.items())}
 
 
 def draw_jobs(settings: DataSettings, role: Role, work_dir: Path) -> list[SyntheticJob]:
@@ -227,6 +242,7 @@ def _recorded(job: RecordedJob, data: PreparedData) -> Sheet:
         "marking_cm": labels.meta.marking_cm,
         "split": chosen_split(labels, recording),
         "counts_as": recording.counts_as,
+        "weight": recording.weight,
         "parts": roles,
     }
     return facts | (dict.fromkeys(_MAPPED) if drive_map is None else _mapped(drive_map))

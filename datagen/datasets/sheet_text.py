@@ -30,6 +30,8 @@ def as_text(sheet: Sheet) -> str:
     ]
     if simulated is not None:
         parts.append(_simulated(simulated))
+    if sheet.get("licences"):
+        parts.append(_licences(sheet["licences"]))
     parts += [_recorded(drive) for drive in sheet["recorded"]]
     if not sheet["recorded"]:
         parts.append("## Recorded drives\n\nNone: it has seen no real image.")
@@ -48,6 +50,20 @@ def _extents(parts: Mapping[str, Mapping[str, int | float | None]]) -> str:
         "| --- | ---: | ---: | ---: | ---: |",
     ]
     return "\n".join([*head, *rows])
+
+
+def _licences(licences: Mapping[str, Mapping[str, int | float]]) -> str:
+    """Table of the recorded drives by their licences."""
+    rows = [
+        f"| {licence or UNKNOWN} | {total['drives']} | {total['frames']} | {total['minutes']:.1f} | "
+        f"{total['km']:.2f} |"
+        for licence, total in licences.items()
+    ]
+    head = [
+        "| licence | recorded drives | frames with labels | minutes | km |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    return "\n".join(["## Recorded drives by licence", "", *head, *rows])
 
 
 def _simulated(facts: Mapping[str, Any]) -> str:
@@ -99,7 +115,7 @@ def _recorded(facts: Mapping[str, Any]) -> str:
     items = [
         f"licence: {_known(facts['licence'])}; car: {_known(facts['car'])}; track: {_known(facts['track'])}",
         f"labels from its {facts['from']}, verdict {_known(facts['verdict'])}; split: {facts['split']}; "
-        f"counts as {counted(facts['counts_as'], 'drive')}",
+        f"counts as {counted(facts['counts_as'], 'drive')}, weight {facts.get('weight', 1.0):g}",
         f"road: {_known(facts['shape'])}{laps}; lines: {kinds}",
         f"lane width: {facts['lane_width_cm']:g} cm, as given; width of the tape: "
         f"{_number(facts['marking_cm'], 1)} cm",

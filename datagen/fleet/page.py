@@ -11,9 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from datagen.fleet.result import DUPLICATE, FAILED, LEFT, FleetResult, Labelled
+from datagen.fleet.result import DUPLICATE, FAILED, LEFT, CarFound, FleetResult, Labelled, TrackFound
 from datagen.fleet.storage import Storage
-from datagen.fleet.task import MAPS
+from datagen.fleet.task import MAPS, TRACKS
 from datagen.fleet.work import REFUSED, REJECTED, THUMBNAIL_NAME
 from lanenet.errors import counted
 from lanenet.page import Picture, Row, bullets, details, gallery, note, page_of, section, subsection, table
@@ -29,6 +29,7 @@ _VERDICTS = {
     LEFT: "left",
     DUPLICATE: "given twice",
 }
+_NOT_COUNTED = " Cameras of cars, the maps that they were found from, and joined maps are not counted."
 #: Maps that are shown of each verdict, and their longer side, [px]; lines of a list. Chosen: a map takes
 #: about 10 kB, so a page has 6 MB at most.
 _MOST_MAPS, _MAP_PX, _MOST_LINES = 150, 240, 200
@@ -37,7 +38,11 @@ _MOST_MAPS, _MAP_PX, _MOST_LINES = 150, 240, 200
 def write_page(result: FleetResult, storage: Storage) -> None:
     """Write the page of a run beside its results."""
     keys = [drive.map_key for drives in _shown(result).values() for drive in drives]
-    page = fleet_page(result, storage.read_all(MAPS, keys, THUMBNAIL_NAME))
+    tracks = [track.key for track in result.tracks[:_MOST_MAPS] if track.joined]
+    thumbnails = storage.read_all(MAPS, keys, THUMBNAIL_NAME) | storage.read_all(
+        TRACKS, tracks, THUMBNAIL_NAME
+    )
+    page = fleet_page(result, thumbnails)
     storage.write(FLEET_PAGE_NAME, page.encode())
 
 
@@ -46,7 +51,7 @@ def fleet_page(result: FleetResult, thumbnails: Mapping[str, bytes]) -> str:
 
     Args:
         result: What became of the drives.
-        thumbnails: JPEG by the key of a map; of those that lack it, the page shows none.
+        thumbnails: JPEG by the key of a map or of joined ones; of those that lack it, the page shows none.
     """
     labelled = result.with_labels
     hours = _text_of_time(fsum(map(_driven_s, labelled)))
@@ -59,6 +64,8 @@ def fleet_page(result: FleetResult, thumbnails: Mapping[str, bytes]) -> str:
         table(_verdict_rows(result)),
         note(f"{result.disk_full}.") if result.disk_full else "",
         *_reasons(result),
+        *_cars(result.cars),
+        *_tracks(result.tracks, thumbnails),
         section("Maps"),
         *(
             part
@@ -70,6 +77,7 @@ def fleet_page(result: FleetResult, thumbnails: Mapping[str, bytes]) -> str:
         note(
             "Of all results that these drives have, whichever run made them; one thread each. Memory is the "
             "most that a process had in RAM. Storage counts maps and labels with their pictures."
+            + (_NOT_COUNTED if result.cars or result.tracks else "")
         ),
         details("By machine", table(_machine_rows(result.drives))),
     ]
@@ -118,6 +126,58 @@ def _reasons(result: FleetResult) -> list[str]:
             bullets(lines[:_MOST_LINES]),
             note(f"And {more} more, in drives.json.") if more > 0 else "",
         ),
+    ]
+
+
+def _cars(cars: Sequence[CarFound]) -> list[str]:
+    """Show the camera of each car, and which drives keep another one."""
+    if not cars:
+        return []
+    rows: list[Row] = [("car", "drives", "with its camera", "found from", "focal length", "pitch", "height")]
+    lines = []
+    for car in cars[:_MOST_LINES]:
+        if car.camera is not None:
+            focal_px, mounting = float(car.camera.K[0, 0]), car.camera.mounting
+            rows.append(
+                (
+                    car.name,
+                    str(len(car.drives)),
+                    str(len(car.drives) - len(car.own)),
+                    f"{len(car.from_drives)}",
+                    f"{focal_px:.1f} +- {focal_px * car.sigma.get('focal', 0.0):.1f} px",
+                    f"{np.rad2deg(mounting.pitch_down_rad):.1f} degrees",
+                    f"{mounting.height_cm:.1f} cm",
+                )
+            )
+        else:
+            rows.append((car.name, str(len(car.drives)), "0", "-", "-", "-", "-"))
+            lines.append(f"{car.name}: no camera for all: {car.reason}")
+        lines += [f"{name} of {car.name} keeps its own camera: {why}" for name, why in car.own.items()]
+    return [section("Cars"), table(rows), bullets(lines[:_MOST_LINES]) if lines else ""]
+
+
+def _tracks(tracks: Sequence[TrackFound], thumbnails: Mapping[str, bytes]) -> list[str]:
+    """Show the joined map of each track, what was not joined, and where lines were laid anew."""
+    if not tracks:
+        return []
+    rows: list[Row] = [("track", "drives with maps", "joined", "lane", "laid anew")]
+    lines, pictures = [], []
+    for track in tracks[:_MOST_LINES]:
+        lane = "-" if track.lane_cm is None else f"{track.lane_cm:.1f} cm"
+        counts = (str(track.count), str(len(track.joined)))
+        rows.append((track.name, *counts, lane, str(len(track.relaid))))
+        if track.reason:
+            lines.append(f"{track.name}: {track.reason}")
+        lines += [f"{name} is not joined to {track.name}: {why}" for name, why in track.left_out.items()]
+        lines += [f"{track.name}: laid anew: {text}" for text in track.relaid]
+        if track.key in thumbnails:
+            caption = f"{track.name}: {', '.join(track.joined)}"
+            pictures.append(Picture(_decoded(thumbnails[track.key]), caption))
+    return [
+        section("Tracks"),
+        table(rows),
+        bullets(lines[:_MOST_LINES]) if lines else "",
+        gallery(pictures) if pictures else "",
     ]
 
 

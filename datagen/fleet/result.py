@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from datagen.fleet.storage import Storage
-from datagen.fleet.task import LABELS, MAPS, FleetDrive
+from datagen.fleet.task import LABELS, MAPS, TRACKS, FleetDrive
 from datagen.fleet.work import LABELS_NAME, REFUSED, REJECTED
 from lanenet.data.files import json_text
+from lanenet.geometry.camera import Camera
 
+#: The list of a run's drives, beside the results.
 INDEX_NAME = "drives.json"
-_INDEX_FORMAT = "lanenet-fleet/1"
+INDEX_FORMAT = "lanenet-fleet/1"
 #: Of a drive that has no result: it failed; the run ended before it was begun; it is there twice.
 FAILED, LEFT, DUPLICATE = "failed", "left", "duplicate"
 
@@ -48,11 +50,74 @@ class Labelled:
 
 
 @dataclass(frozen=True)
+class CarFound:
+    """What became of the camera of a car.
+
+    Attributes:
+        name: Of the car.
+        drives: Names of its drives.
+        key: Of the camera, in the storage; empty if there is none.
+        from_maps: Keys of the maps that it was found from.
+        from_drives: Names of their drives.
+        own: Why drives keep the camera that they gave by themselves, by their names.
+        reason: Why there is none.
+        camera: The camera; None without one.
+        sigma: Standard deviation of each of its numbers, focal length relative.
+    """
+
+    name: str
+    drives: tuple[str, ...]
+    key: str = ""
+    from_maps: tuple[str, ...] = ()
+    from_drives: tuple[str, ...] = ()
+    own: dict[str, str] = field(default_factory=dict)
+    reason: str = ""
+    camera: Camera | None = None
+    sigma: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TrackFound:
+    """What became of the maps of a track.
+
+    Attributes:
+        name: Of the track.
+        count: Its drives with maps.
+        key: Of the joined maps, in the storage.
+        asked: Names of the drives whose maps were to be joined.
+        joined: Names of those whose were.
+        left_out: Why others were not, by their names.
+        lane_cm: Width of the lane; None if nothing was joined.
+        relaid: Places where lines were laid anew, a sentence each.
+        reason: Why nothing was joined.
+    """
+
+    name: str
+    count: int
+    key: str
+    asked: tuple[str, ...]
+    joined: tuple[str, ...] = ()
+    left_out: dict[str, str] = field(default_factory=dict)
+    lane_cm: float | None = None
+    relaid: tuple[str, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class FleetResult:
-    """What became of all drives of a run, in their order, and whether a full disk ended it."""
+    """What became of all drives of a run, in their order, of their cars and tracks.
+
+    Attributes:
+        drives: The drives.
+        disk_full: Which disk ended the run, being full.
+        cars: Cars with several drives.
+        tracks: Tracks with several drives.
+    """
 
     drives: tuple[Labelled, ...]
     disk_full: str = ""
+    cars: tuple[CarFound, ...] = ()
+    tracks: tuple[TrackFound, ...] = ()
 
     def of(self, *verdicts: str) -> list[Labelled]:
         """Return the drives with one of the verdicts."""
@@ -79,8 +144,9 @@ def write_index(result: FleetResult, storage: Storage) -> None:
 
 
 def _index(result: FleetResult) -> dict[str, Any]:
+    joined = {name: f"{TRACKS}/{track.key}/{name}" for track in result.tracks for name in track.joined}
     return {
-        "format": _INDEX_FORMAT,
+        "format": INDEX_FORMAT,
         "drives": [
             {
                 **vars(found.drive),
@@ -88,6 +154,7 @@ def _index(result: FleetResult) -> dict[str, Any]:
                 "reason": found.reason,
                 "map": None if found.mapped is None else f"{MAPS}/{found.map_key}",
                 "labels": f"{LABELS}/{found.labels_key}/{LABELS_NAME}" if found.has_labels else None,
+                "joined": joined.get(found.drive.name),
             }
             for found in result.drives
         ],

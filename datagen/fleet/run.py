@@ -2,70 +2,23 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 
-from datagen.fleet.engine import Engine, Task
-from datagen.fleet.memory import memory_bytes
+from datagen.fleet.cars import find_cameras, with_camera, without_camera
+from datagen.fleet.engine import Engine
 from datagen.fleet.page import write_page
-from datagen.fleet.result import DUPLICATE, FAILED, LEFT, FleetResult, Labelled, standing, write_index
-from datagen.fleet.source import checksum, drive_files
+from datagen.fleet.result import CarFound, FleetResult, Labelled, write_index
+from datagen.fleet.stage import Finished, Progress, Stage
 from datagen.fleet.storage import Storage
-from datagen.fleet.task import LABELS, MAPS, FleetDrive, FleetSettings
-from datagen.fleet.work import REFUSED, REJECTED, Job, Outcome, label_drive, version
-from datagen.made import key_of
-from lanenet.data.files import json_text
-from lanenet.errors import LanenetError
+from datagen.fleet.task import CAMERAS, LABELS, MAPS, TRACKS, FleetDrive, FleetSettings
+from datagen.fleet.tracks import join_tracks, named_tracks, recognised_tracks
+from datagen.fleet.work import REFUSED, REJECTED
 from lanenet.outputs import lock_output
 
-#: The checksums of the drives' files, beside the results.
-CHECKSUMS_NAME = "checksums.json"
-
-
-@dataclass(frozen=True)
-class Counts:
-    """How many drives of a run are done, refused (or their maps rejected), failed, and in all."""
-
-    done: int
-    refused: int
-    failed: int
-    total: int
-
-    @property
-    def ended(self) -> int:
-        """Drives that are not left to be done."""
-        return self.done + self.refused + self.failed
-
-
-#: Called whenever a drive has ended.
-Progress = Callable[[Counts], None]
-
-
-def with_checksums(drives: Iterable[FleetDrive], storage: Storage) -> list[FleetDrive]:
-    """Return the drives with the checksums of their files; without one if they are not there or unreadable.
-
-    Files that have the size and time of an earlier run are not read again.
-    """
-    known: dict[str, list[str]] = json.loads(storage.read(CHECKSUMS_NAME) or b"{}")
-    found: dict[str, list[str]] = {}
-    checked = []
-    for drive in drives:
-        before = known.get(drive.source, ["", ""])
-        try:
-            stamp = key_of(drive_files(drive.source))
-            found[drive.source] = before if before[0] == stamp else [stamp, checksum(drive.source)]
-        except (LanenetError, OSError):  # the run says why, and does the others
-            checked.append(replace(drive, checksum=""))
-            continue
-        checked.append(replace(drive, checksum=found[drive.source][1]))
-    if any(known.get(source) != pair for source, pair in found.items()):
-        storage.write(CHECKSUMS_NAME, json_text({**known, **found}).encode())
-    return checked
+#: Verdicts of maps, the best first.
+_GRADES = ("good", "usable", REJECTED, REFUSED)
 
 
 def label_all(
@@ -75,6 +28,8 @@ def label_all(
     engine: Engine,
     progress: Progress | None = None,
     refused_again: bool = False,
+    each_alone: bool = False,
+    find_tracks: bool = False,
 ) -> FleetResult:
     """Map and label drives, as far as that has not been done with the same settings.
 
@@ -82,13 +37,18 @@ def label_all(
     that fail and workers that are lost stop nothing; a full disk ends the run. What is finished is kept in
     any case, also at Ctrl-C.
 
+    Drives of one car are mapped alone first, and then with the camera that is found from them together, see
+    :mod:`datagen.fleet.cars`. Maps of one track are joined at the end, see :mod:`datagen.fleet.tracks`.
+
     Args:
         drives: Drives with their checksums.
         settings: What they are made with.
         storage: Where results are kept; no other run may write there.
         engine: What spreads the tasks.
-        progress: Called whenever a drive has ended.
+        progress: Called whenever a drive has ended; counts begin anew with each stage.
         refused_again: Try drives again that were refused before.
+        each_alone: Neither look for cameras of cars nor join maps.
+        find_tracks: Recognise the track of drives that name none, which compares all pairs of maps.
 
     Raises:
         LanenetError: If another run writes there, or the engine cannot be started.
@@ -96,138 +56,108 @@ def label_all(
     with ExitStack() as stack:
         if storage.folder is not None:
             stack.enter_context(lock_output(storage.folder))
-        run = _Run(drives, settings, storage)
-        run.sweep(run.refused_keys() if refused_again else set())
-        found = run.look()
-        missing = [k for k, drive in enumerate(found) if drive.verdict == LEFT]
-        ended: dict[int, Outcome] = {}
-        disk_full = ""
-        if missing:
-            try:
-                ended, disk_full = run.work(missing, found, engine, progress)
-            finally:
-                run.sweep()
-            found = run.look(ended)
-        result = FleetResult(tuple(found), disk_full)
+        for kind in (MAPS, LABELS, CAMERAS, TRACKS):
+            storage.sweep(kind)
+        run = _Run(settings, storage, engine, progress, refused_again)
+        cars: dict[str, list[int]] = {} if each_alone else without_camera(drives)
+        result = run.label(drives, cars)
+        if not (each_alone or result.disk_full):
+            result = run.join(result, find_tracks)
         write_index(result, storage)
         write_page(result, storage)
         return result
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Run:
-    """The drives of a run and their storage."""
+    """A run: its stages one after the other.
 
-    drives: Sequence[FleetDrive]
+    Attributes:
+        settings, storage, engine, progress, refused_again: See :func:`label_all`.
+        tried: Keys of the maps of drives for which something was done.
+    """
+
     settings: FleetSettings
     storage: Storage
+    engine: Engine
+    progress: Progress | None
+    refused_again: bool
+    tried: set[str] = field(default_factory=set)
 
-    @cached_property
-    def unusable(self) -> dict[int, str]:
-        """Why the work on drives cannot begin, by their places."""
-        reasons = {k: _why_not(drive, self.settings) for k, drive in enumerate(self.drives)}
-        return {k: reason for k, reason in reasons.items() if reason}
-
-    @cached_property
-    def keys(self) -> dict[str, list[str]]:
-        """The keys of all maps and of all labels; those of unusable drives are of nothing."""
-        maps, labels = FleetDrive.map_key, FleetDrive.labels_key
-        return {
-            kind: [
-                f"unusable-{k}" if k in self.unusable else key(drive, self.settings)
-                for k, drive in enumerate(self.drives)
-            ]
-            for kind, key in ((MAPS, maps), (LABELS, labels))
+    def label(self, drives: Sequence[FleetDrive], cars: dict[str, list[int]]) -> FleetResult:
+        """Map drives with the cameras of their cars, where there are any, and label all of them."""
+        chosen, found_cars = list(drives), list[CarFound]()
+        alone: dict[int, Labelled] = {}
+        if cars:
+            places = [place for group in cars.values() for place in group]
+            stage = self._finish(
+                Stage([drives[k] for k in places], self.settings, self.storage, labels=False)
+            )
+            alone = dict(zip(places, stage.drives, strict=True))
+            disk_full = stage.disk_full
+            if not disk_full:
+                groups = {car: [alone[k] for k in group] for car, group in cars.items()}
+                found_cars, disk_full = find_cameras(groups, self.storage, self.engine)
+            if disk_full:
+                return self._ended(chosen, found_cars, disk_full)
+            for car in found_cars:
+                for place in cars[car.name] if car.key else ():
+                    if drives[place].name not in car.own:
+                        chosen[place] = with_camera(drives[place], car, self.storage)
+        stage = self._finish(Stage(chosen, self.settings, self.storage))
+        worse = {
+            place: stage.drives[place]
+            for place, before in alone.items()
+            if chosen[place] is not drives[place] and _is_worse(stage.drives[place], before)
         }
+        if worse and not stage.disk_full:
+            for place, with_it in worse.items():
+                chosen[place] = drives[place]
+                car = next(car for car in found_cars if drives[place].name in car.drives)
+                car.own[drives[place].name] = _why_worse(with_it, alone[place])
+            stage = self._finish(Stage(chosen, self.settings, self.storage))
+        return self._ended(chosen, found_cars, stage.disk_full, stage.drives)
 
-    def results(self, kind: str) -> list[dict[str, Any] | None]:
-        """Return what the markers of a kind say; None for what is not finished."""
-        finished = self.storage.finished(kind)
-        found = self.storage.results(kind, finished.intersection(self.keys[kind]))
-        return [found.get(key) for key in self.keys[kind]]
+    def join(self, result: FleetResult, find_tracks: bool) -> FleetResult:
+        """Join the maps of each track."""
+        tracks = (
+            recognised_tracks(result.drives, self.storage, self.engine)
+            if find_tracks
+            else named_tracks(result.drives)
+        )
+        found, disk_full = join_tracks(tracks, self.storage, self.engine)
+        return replace(result, tracks=tuple(found), disk_full=disk_full)
 
-    def refused_keys(self) -> set[str]:
-        """Return the keys of the maps and labels that say that their drive was refused."""
-        return {
-            key
-            for kind, keys in self.keys.items()
-            for key, result in zip(keys, self.results(kind), strict=True)
-            if result is not None and result["verdict"] == REFUSED
-        }
+    def _finish(self, stage: Stage) -> Finished:
+        if self.refused_again:
+            again = stage.refused_keys() - self.tried
+            stage.sweep(again)
+        finished = stage.finish(self.engine, self.progress)
+        for drive in finished.drives:
+            if drive.new:
+                self.tried |= {drive.map_key, drive.labels_key}
+        return finished
 
-    def sweep(self, also: Iterable[str] = ()) -> None:
-        """Remove what lost workers left, and these results."""
-        for kind in (MAPS, LABELS):
-            self.storage.sweep(kind, also)
-
-    def look(self, ended: Mapping[int, Outcome] | None = None) -> list[Labelled]:
-        """Return how each drive stands.
-
-        Args:
-            ended: How the tasks ended that were run.
-        """
-        maps, labels = self.results(MAPS), self.results(LABELS)
-        found = []
-        for k, drive in enumerate(self.drives):
-            first = self.keys[MAPS].index(self.keys[MAPS][k])
-            outcome = None if ended is None else ended.get(k)
-            if k in self.unusable:
-                verdict, reason = FAILED, self.unusable[k]
-            elif first != k:
-                verdict, reason = DUPLICATE, f"is the same recording as {self.drives[first].name}"
-            elif outcome is not None and not outcome.verdict:
-                verdict, reason = FAILED, outcome.reason
-            else:
-                verdict, reason = standing(maps[k], labels[k])
-                if verdict == LEFT and outcome is not None:
-                    verdict = FAILED
-                    reason = f"its worker finished it, but not in the {self.storage.url} of this machine"
-            keys = self.keys[MAPS][k], self.keys[LABELS][k]
-            found.append(Labelled(drive, verdict, reason, outcome is not None, *keys, maps[k], labels[k]))
-        return found
-
-    def work(
+    def _ended(
         self,
-        missing: Sequence[int],
-        found: Sequence[Labelled],
-        engine: Engine,
-        progress: Progress | None,
-    ) -> tuple[dict[int, Outcome], str]:
-        """Do what is missing; returns how the tasks ended, and which disk was full."""
-        verdicts = {k: drive.verdict for k, drive in enumerate(found) if drive.verdict != DUPLICATE}
-        total, ended = len(verdicts), dict[int, Outcome]()
-        tasks = [self._task(k) for k in missing]
-        with closing(engine.run(label_drive, tasks)) as running:
-            _tell(progress, verdicts.values(), total)
-            for end in running:
-                k = missing[end.number]
-                ended[k] = Outcome("", end.error) if end.error else end.result
-                verdicts[k] = ended[k].verdict or FAILED
-                _tell(progress, verdicts.values(), total)
-                if ended[k].disk_full:
-                    return ended, ended[k].reason
-        return ended, ""
-
-    def _task(self, k: int) -> Task:
-        drive = self.drives[k]
-        job = Job(drive, self.settings, self.storage.url, version())
-        return Task(drive.name, job, memory_bytes(drive.source))
+        drives: Sequence[FleetDrive],
+        cars: Sequence[CarFound],
+        disk_full: str,
+        found: Sequence[Labelled] | None = None,
+    ) -> FleetResult:
+        """Return how all drives stand; what was done for one in an earlier stage counts as well."""
+        standing = Stage(drives, self.settings, self.storage).look() if found is None else found
+        drives_found = [replace(one, new=one.new or one.map_key in self.tried) for one in standing]
+        return FleetResult(tuple(drives_found), disk_full, tuple(cars))
 
 
-def _why_not(drive: FleetDrive, settings: FleetSettings) -> str:
-    """Say why the work on a drive cannot begin; nothing if it can."""
-    try:
-        if not drive.checksum:
-            checksum(drive.source)
-            return f"{drive.source}: could not be read when the run began"
-        drive.labels_key(settings)
-    except (LanenetError, OSError) as error:
-        return str(error)
-    return ""
+def _is_worse(found: Labelled, alone: Labelled) -> bool:
+    """Tell whether a drive has a worse map with its car's camera than with its own."""
+    if alone.verdict not in _GRADES or found.verdict not in _GRADES:
+        return False
+    return _GRADES.index(found.verdict) > _GRADES.index(alone.verdict)
 
 
-def _tell(progress: Progress | None, verdicts: Iterable[str], total: int) -> None:
-    if progress is not None:
-        count = Counter(verdicts)
-        refused, failed = count[REJECTED] + count[REFUSED], count[FAILED]
-        progress(Counts(count.total() - count[LEFT] - refused - failed, refused, failed, total))
+def _why_worse(found: Labelled, alone: Labelled) -> str:
+    why = found.reason or "; ".join((found.mapped or {}).get("reasons", ()))
+    return f"with the car's camera its map is {found.verdict}, with its own {alone.verdict}: {why}"

@@ -15,7 +15,7 @@ from lanenet.data.camera_file import read_camera
 from lanenet.perception.edges.road import COLOUR_WEIGHT
 
 #: Kinds of result.
-MAPS, LABELS = "maps", "labels"
+MAPS, LABELS, CAMERAS, TRACKS = "maps", "labels", "cameras", "tracks"
 
 
 class FleetSettings(Settings):
@@ -45,6 +45,9 @@ class FleetDrive:
         wheelbase_cm: Distance between the axles; None if unknown.
         camera_height_cm: Height of the lens above the road; None if unknown.
         tape_width_cm: Width of the tape; None if unknown.
+        car: Name of the car, or of one of its cameras: drives of one name are taken for drives with one
+            camera; empty if unknown.
+        track: Name of the track; empty if unknown.
     """
 
     name: str
@@ -55,6 +58,8 @@ class FleetDrive:
     wheelbase_cm: float | None = None
     camera_height_cm: float | None = None
     tape_width_cm: float | None = None
+    car: str = ""
+    track: str = ""
 
     def map_key(self, settings: FleetSettings) -> str:
         """Return the key of its map: of the recording, what is known of it, and all settings of the mapping.
@@ -62,7 +67,9 @@ class FleetDrive:
         Raises:
             CalibrationError: If the camera cannot be read.
         """
-        known = {**vars(self), "name": None, "source": None}
+        # Its car and track change what becomes of the map, not the map.
+        known = {key: value for key, value in vars(self).items() if key not in ("car", "track")}
+        known |= {"name": None, "source": None}
         if self.camera is not None:
             with on_this_machine(self.camera) as path:
                 camera = read_camera(path)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -55,12 +56,14 @@ class Job:
         settings: What it is made with.
         out: Path or URL of the storage.
         made_by: The :func:`version` of the program that wants it.
+        labels: Whether labels are wanted beside the map.
     """
 
     drive: FleetDrive
     settings: FleetSettings
     out: str
     made_by: str
+    labels: bool = True
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,8 @@ class Outcome:
     """How the work on a drive ended.
 
     Attributes:
-        verdict: Of the map, if the drive has labels; else ``reject``, ``refused`` or, if it failed, empty.
-        reason: Why it has none.
+        verdict: Of the map, if the work was done; else ``reject``, ``refused`` or, if it failed, empty.
+        reason: Why it was not.
         disk_full: Whether it failed for want of room, as the next one would.
     """
 
@@ -88,11 +91,21 @@ def label_drive(job: Job) -> Outcome:
 
     A drive that cannot be mapped has a result, too. What else goes wrong is said, and left to the next run.
     """
+    return attempted(job.made_by, lambda: _label_drive(job))
+
+
+def attempted(made_by: str, work: Callable[[], Outcome]) -> Outcome:
+    """Work in one thread; what goes wrong is said.
+
+    Args:
+        made_by: The :func:`version` of the program that wants it.
+        work: What to do.
+    """
     use_one_thread()
     try:
-        if job.made_by != version():
-            raise LanenetError(f"{platform.node()} has {version()}, the run needs {job.made_by}")
-        return _label_drive(job)
+        if made_by != version():
+            raise LanenetError(f"{platform.node()} has {version()}, the run needs {made_by}")
+        return work()
     except MemoryError:
         return Outcome("", "out of memory")
     except Exception as error:
@@ -111,6 +124,8 @@ def _label_drive(job: Job) -> Outcome:
                 mapped = _map(job, path, folder)
         if mapped["verdict"] in (REJECTED, REFUSED):
             return Outcome(mapped["verdict"], mapped["reason"])
+        if not job.labels:
+            return Outcome(mapped["verdict"])
         labelled = storage.result(LABELS, labels_key)
         if labelled is None:
             with storage.fetched(MAPS, map_key) as map_folder, storage.new(LABELS, labels_key) as folder:
@@ -120,13 +135,19 @@ def _label_drive(job: Job) -> Outcome:
 
 def _map(job: Job, path: Path, folder: Path) -> dict[str, Any]:
     """Map a drive into a folder; returns what its marker says."""
+    with ExitStack() as stack:
+        camera = job.drive.camera
+        here = None if camera is None else stack.enter_context(on_this_machine(camera))
+        return _map_with(job, path, folder, here)
+
+
+def _map_with(job: Job, path: Path, folder: Path, camera: Path | None) -> dict[str, Any]:
     drive, settings = job.drive, job.settings
     meter, found = Meter(), {"verdict": REFUSED, "reason": "", "reasons": [], "frames": 0, "driven_s": 0.0}
     try:
         recording = open_drive(path)
         found |= {"frames": len(recording), "driven_s": round(driven_s(recording), 3)}
         found |= {"width": recording.width, "height": recording.height}
-        camera = None if drive.camera is None else local_path(drive.camera)
         request = MapRequest(
             path,
             drive.lane_width_cm,
@@ -143,9 +164,9 @@ def _map(job: Job, path: Path, folder: Path) -> dict[str, Any]:
         rejected = verdict.grade == REJECTED
         found |= {"verdict": verdict.grade, "reason": verdict.sentence if rejected else ""}
         found["reasons"] = list(report.figures["verdict"]["reasons"])
-        _name_source(folder / "map.yaml", drive.source)
+        name_source(folder / "map.yaml", drive.source)
         _draw_thumbnail(folder, path)
-    return _mark(folder, drive, found, meter)
+    return mark(folder, {**vars(drive), **found}, meter)
 
 
 def _label(job: Job, path: Path, map_folder: Path, folder: Path) -> dict[str, Any]:
@@ -166,16 +187,15 @@ def _label(job: Job, path: Path, map_folder: Path, folder: Path) -> dict[str, An
     else:
         found["frames_labelled"] = report.figures["frames_labelled"]
         found["residual_cm"] = report.figures["residual_cm"]["median"]
-    return _mark(folder, job.drive, found, meter)
+    return mark(folder, {**vars(job.drive), **found}, meter)
 
 
-def _mark(folder: Path, drive: FleetDrive, found: dict[str, Any], meter: Meter) -> dict[str, Any]:
+def mark(folder: Path, found: dict[str, Any], meter: Meter) -> dict[str, Any]:
     """Write the marker of a result, which alone knows when and where it was made."""
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     made = {"by": version(), "on": platform.node(), "at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
     marker = {
         "format": _FORMAT,
-        **vars(drive),
         **found,
         "bytes": size,
         "took": meter.taken(),
@@ -191,7 +211,7 @@ def driven_s(drive: Drive) -> float:
     return float(steps_s[steps_s <= MAX_PAUSE_S].sum())
 
 
-def _name_source(file: Path, source: str) -> None:
+def name_source(file: Path, source: str) -> None:
     """Let a map name its drive by the place where it lies for all, not by where this machine had it."""
     if local_path(source) is None:
         plain = {**read_yaml(file), "drive": source}
@@ -203,6 +223,11 @@ def _draw_thumbnail(folder: Path, drive: Path) -> None:
     if not (folder / "map.png").is_file():
         mapped = open_mapped_drive(folder, drive)
         draw_map(folder / "map.png", mapped.drive_map, _clouds(folder, mapped.drive_map), mapped.starts)
+    shrink_picture(folder)
+
+
+def shrink_picture(folder: Path) -> None:
+    """Make a thumbnail of the picture of a map, or of maps that were joined."""
     write_bytes(folder / THUMBNAIL_NAME, _small_jpeg(read_image(folder / "map.png", MapFormatError)))
 
 

@@ -116,6 +116,11 @@ def same_lens(drives: Sequence[DriveCamera]) -> bool:
 
 def difference(first: DriveCamera, second: DriveCamera) -> CameraDifference:
     """Compare the cameras of two drives; they have to be of one kind."""
+    return CameraDifference(sigmas_apart(first, second), *_apart(first.camera, second.camera))
+
+
+def sigmas_apart(first: DriveCamera, second: DriveCamera) -> dict[str, float]:
+    """Return the difference of each number of two cameras, in sigmas of both together."""
     a, b = (numbers(one.camera) for one in (first, second))
     sigmas = {}
     for name, least in _LEAST.items():
@@ -123,7 +128,7 @@ def difference(first: DriveCamera, second: DriveCamera) -> CameraDifference:
         sigmas[name] = float((b[name] - a[name]) / np.linalg.norm([*own, least]))
     by_focal = [one.sigma.get("focal", 0.0) for one in (first, second)]
     sigmas["height"] = float((b["height"] - a["height"]) / np.linalg.norm([*by_focal, _HEIGHT_SIGMA]))
-    return CameraDifference(sigmas, *_apart(first.camera, second.camera))
+    return sigmas
 
 
 def numbers(camera: Camera) -> dict[str, float]:

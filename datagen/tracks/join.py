@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -17,7 +17,7 @@ from datagen.lanes.find import MappedSegment, find_lane
 from datagen.lanes.scale import LaneWidth, fitted_width
 from datagen.pipeline import write_checked
 from datagen.quality.figures import Report
-from datagen.slam.segment import SolvedSegment, StageProgress
+from datagen.slam.segment import StageProgress
 from datagen.tracks.cameras import CameraDifference, DriveCamera, difference, same_lens
 from datagen.tracks.pictures import draw_joined
 from datagen.tracks.recognise import Recognised, recognise
@@ -71,23 +71,79 @@ def join_maps(folders: Sequence[Path], out: Path, progress: StageProgress | None
     with lock_output(out):
         check_replaceable(out, "joined")
         tell = progress or (lambda stage, done, total: None)
-        visits = [read_visit(folder) for folder in folders]
-        placed = place_visits(visits, tell)
-        compile_ahead()
-        cameras = _camera_differences([one.visit.moved(one.move).found_camera for one in placed])
-        shared = bool(cameras) and all(one.agree for one in cameras.values())
-        rng = np.random.default_rng(placed[0].visit.prepared.settings.seed)
-        tell("adjust", 0, 1)
-        together = solve_together([one.visit.moved(one.move) for one in placed], shared, rng)
-        tell("lines and checks", 0, len(placed) + 1)
-        return _write(_names(placed), together, shared, cameras, out, tell)
+        placed, refused = place_visits([read_visit(folder) for folder in folders], tell)
+        if refused:
+            why = "; ".join(f"{folders[number]} {reason}" for number, reason in refused.items())
+            raise LanenetError(f"not joined to {folders[0]}: {why}")
+        return _join(_names([placed[number] for number in range(len(folders))]), out, tell)
 
 
-def place_visits(visits: Sequence[Visit], tell: StageProgress) -> list[Placed]:
-    """Find how each map lies on the first one, over others where it shares too little with that.
+def join_fitting(visits: Mapping[str, Visit], out: Path, progress: StageProgress | None = None) -> Report:
+    """Join the most maps that are of one track, and leave the others out.
+
+    Args:
+        visits: Maps of different drives, by the names that theirs get in the joined folder.
+        out: Folder to write.
+        progress: Called with (stage, done, total).
+
+    Returns:
+        As :func:`join_maps`; the figures also have why maps were left out, ``left_out``, by their names.
 
     Raises:
-        LanenetError: Names the maps that are not of this track, and why.
+        LanenetError: If no two are certainly of one track.
+        TrackingLostError: If the drives together show no lane.
+    """
+    with lock_output(out):
+        check_replaceable(out, "joined")
+        tell = progress or (lambda stage, done, total: None)
+        best, left_out = _largest_track(visits, tell)
+        if len(best) < 2:
+            why = "; ".join(f"{name} {reason}" for name, reason in left_out.items())
+            raise LanenetError(f"no two of {len(visits)} maps are joined: {why}")
+        report = _join(best, out, tell)
+        return replace(report, figures={**report.figures, "left_out": left_out})
+
+
+def _largest_track(
+    visits: Mapping[str, Visit], tell: StageProgress
+) -> tuple[dict[str, Placed], dict[str, str]]:
+    """Find the most maps that lie on one another, and why the others do not lie on them."""
+    best: dict[str, Placed] = {}
+    reasons, left = dict[str, str](), list(visits)
+    earlier: list[tuple[list[str], dict[str, str]]] = []
+    while len(left) > len(best):
+        found, refused = place_visits([visits[name] for name in left], tell)
+        placed = {left[number]: one for number, one in found.items()}
+        why = {left[number]: reason for number, reason in refused.items()}
+        earlier.append((list(placed), why))
+        if len(placed) > len(best):
+            best, reasons = placed, why
+        left = list(why)
+    for names, why in earlier:
+        # Maps that were placed before the best ones were refused there, each for the same reason.
+        first = next((name for name in best if name in why), None)
+        reasons |= {name: why[first] for name in names if first is not None and name not in best}
+    return best, {name: reasons[name] for name in visits if name not in best}
+
+
+def _join(placed: dict[str, Placed], out: Path, tell: StageProgress) -> Report:
+    """Adjust maps together that lie on the first one, and write the folder."""
+    compile_ahead()
+    moved = [one.visit.moved(one.move) for one in placed.values()]
+    cameras = _camera_differences([visit.found_camera for visit in moved])
+    shared = bool(cameras) and all(one.agree for one in cameras.values())
+    rng = np.random.default_rng(moved[0].prepared.settings.seed)
+    tell("adjust", 0, 1)
+    together = solve_together(moved, shared, rng)
+    tell("lines and checks", 0, len(placed) + 1)
+    return _write(placed, together, shared, cameras, out, tell)
+
+
+def place_visits(visits: Sequence[Visit], tell: StageProgress) -> tuple[dict[int, Placed], dict[int, str]]:
+    """Find how each map lies on the first one, over others where it shares too little with that.
+
+    Returns:
+        The maps of the first one's track, by their places among all, and why the others are none.
     """
     shapes = [read_shape(one.folder) for one in visits]
     placed: dict[int, Placed] = {0: Placed(visits[0], Similarity())}
@@ -112,13 +168,8 @@ def place_visits(visits: Sequence[Visit], tell: StageProgress) -> list[Placed]:
         if len(placed) == before:
             break
     missing = [number for number in range(len(visits)) if number not in placed]
-    if missing:
-        why = "; ".join(
-            f"{visits[number].folder} {_NOT_JOINED[refused[number].answer]}: {refused[number].sentence}"
-            for number in missing
-        )
-        raise LanenetError(f"not joined to {visits[0].folder}: {why}")
-    return [placed[number] for number in range(len(visits))]
+    why = {n: f"{_NOT_JOINED[refused[n].answer]}: {refused[n].sentence}" for n in missing}
+    return {number: placed[number] for number in sorted(placed)}, why
 
 
 _NOT_JOINED = {
@@ -238,23 +289,17 @@ def _own_frames(together: Together, whole: MappedSegment, number: int) -> Mapped
     laps = whole.laps[rows]
     return replace(
         whole,
-        solved=_solved_of(together, number),
+        solved=together.solved_of(number),
         s_frames_cm=whole.s_frames_cm[rows],
         laps=laps - laps.min(),
     )
-
-
-def _solved_of(together: Together, number: int) -> SolvedSegment:
-    rows = np.flatnonzero(together.of == number)
-    own = together.solved.only(rows)
-    return replace(own, rows=np.arange(len(rows)), part=own.part - own.part[0])
 
 
 def _relaid(placed: dict[str, Placed], together: Together, whole: MappedSegment) -> list[RelaidPlace]:
     """Fit each drive's lines to its own edges, and find where they contradict each other."""
     shapes = []
     for number, (name, visit) in enumerate(zip(placed, together.visits, strict=True)):
-        solved, settings = _solved_of(together, number), visit.prepared.settings
+        solved, settings = together.solved_of(number), visit.prepared.settings
         try:
             own = find_lane(solved, None, visit.prepared.held_out, settings.trace, settings.fit, whole.dark)
         except TrackingLostError:
@@ -322,6 +367,7 @@ def _figures(
         "lane_cm": factor * lane.width_cm,
         "relaid": [
             {
+                "text": p.text,
                 "drives": list(p.drives),
                 "at_cm": list(p.at_cm),
                 "length_cm": p.length_cm,

@@ -1,7 +1,8 @@
-"""Drives of one track adjusted together: every place of it is held by all drives that saw it.
+"""Drives adjusted together: those of one track, every place of which is held by all drives that saw it.
 
 Where cars shared one camera, its numbers are adjusted, too. Other drives keep theirs: their edges are drawn
-as the camera of the first drive would have seen them, so that all of them can be compared in pixels.
+as the camera of the first drive would have seen them, so that all of them can be compared in pixels. Drives
+of several tracks can share a camera as well; then each is held by its own laps.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ _APART_PERIODS = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """Drives of one track in one map frame, in the scale of the first one.
+    """Drives in the scale of the first one, and of one track also in its map frame.
 
     Attributes:
         visits: The drives, adjusted.
@@ -57,21 +58,30 @@ class Together:
     solved: SolvedSegment
     of: Int[np.ndarray, "n"]
 
+    def solved_of(self, number: int) -> SolvedSegment:
+        """Return the frames of one drive, as a segment of its own."""
+        rows = np.flatnonzero(self.of == number)
+        own = self.solved.only(rows)
+        return replace(own, rows=np.arange(len(rows)), part=own.part - own.part[0])
 
-def solve_together(visits: Sequence[Visit], shared: bool, rng: np.random.Generator) -> Together:
-    """Adjust drives of one track together.
+
+def solve_together(
+    visits: Sequence[Visit], shared: bool, rng: np.random.Generator, one_track: bool = True
+) -> Together:
+    """Adjust drives together.
 
     Args:
-        visits: The drives, moved onto the first one's map.
+        visits: The drives; those of one track moved onto the first one's map, others in its scale.
         shared: Whether they shared one camera, which is then adjusted.
         rng: Draws the edges that are compared.
+        one_track: Whether their maps lie on each other; else no drive is compared with another.
     """
     settings, first = visits[0].prepared.settings, visits[0]
     of = np.repeat(np.arange(len(visits)), [len(one.poses) for one in visits])
     camera = mean_camera(visits) if shared else first.camera
     tilt = np.concatenate([one.tilt_rad if shared else np.zeros((len(one.poses), 2)) for one in visits])
     estimate = BundleEstimate(np.concatenate([one.poses for one in visits]), tilt, camera)
-    loops = _loops(visits, estimate.poses, of, camera)
+    loops = _loops(visits, estimate.poses, of, camera, one_track)
     if shared:
         found, observed = _with_camera(visits, estimate, loops, rng)
         edges: list[EdgePixels] = list(observed.edges)
@@ -211,9 +221,13 @@ def _projected(road: RoadEdges, behind_cm: float, camera: Camera) -> EdgePixels:
 
 
 def _loops(
-    visits: Sequence[Visit], poses: Float[np.ndarray, "n 3"], of: Int[np.ndarray, "n"], camera: Camera
+    visits: Sequence[Visit],
+    poses: Float[np.ndarray, "n 3"],
+    of: Int[np.ndarray, "n"],
+    camera: Camera,
+    one_track: bool,
 ) -> list[tuple[int, int]]:
-    """Pairs of frames that show the same road: of laps of one drive, and of different drives."""
+    """Pairs of frames that show the same road: of laps of one drive, and of different drives of a track."""
     height_cm = camera.mounting.height_cm
     pairs: list[tuple[int, int]] = []
     for number, one in enumerate(visits):
@@ -223,7 +237,7 @@ def _loops(
         if keys is not None:
             own += keyframe_pairs(keys, settings.bundle.lags, one.commands.part)
         pairs += [(int(rows[a]), int(rows[b])) for a, b in own]
-        for other in range(number):
+        for other in range(number if one_track else 0):
             pairs += views_shared(poses, np.flatnonzero(of == other), rows, height_cm)
     return pairs
 

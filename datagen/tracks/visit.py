@@ -81,13 +81,17 @@ class Visit:
         return view_road(self.prepared.drive, camera, self.prepared.settings, self.keys)
 
 
-def read_visit(folder: Path) -> Visit:
+def read_visit(folder: Path, drive_path: Path | None = None) -> Visit:
     """Read a map and the frames of its longest segment.
+
+    Args:
+        folder: The map.
+        drive_path: Where its drive is, if not where it was mapped.
 
     Raises:
         LanenetError: If the map or its drive cannot be read.
     """
-    mapped = open_mapped_drive(folder)
+    mapped = open_mapped_drive(folder, drive_path)
     drive_map, meta = mapped.drive_map, mapped.drive_map.meta
     chosen = np.flatnonzero(drive_map.segment == longest_segment(drive_map))
     drive = keep_images(mapped.drive.subset(mapped.rows[chosen]))

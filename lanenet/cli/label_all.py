@@ -93,6 +93,19 @@ def label_all(
             help="Ray cluster that this machine is part of; default: a new one here.",
         ),
     ] = None,
+    car: Annotated[
+        str, typer.Option(metavar="NAME", help="Car of the drives that are listed: they have one camera.")
+    ] = "",
+    track: Annotated[
+        str, typer.Option(metavar="NAME", help="Track of the drives that are listed: their maps are joined.")
+    ] = "",
+    find_tracks: Annotated[
+        bool,
+        typer.Option("--find-tracks", help="Recognise drives of one track by their maps, and join them."),
+    ] = False,
+    each_alone: Annotated[
+        bool, typer.Option("--each-alone", help="No camera for all drives of a car, and no joined maps.")
+    ] = False,
     pictures: Annotated[
         bool, typer.Option("--pictures", help="Draw the report of each map and the frames of each label set.")
     ] = False,
@@ -100,9 +113,13 @@ def label_all(
         bool, typer.Option("--refused-again", help="Try drives again that were refused before.")
     ] = False,
 ) -> None:
-    """Map and label many drives; what is finished is used, and what fails stops nothing."""
+    """Map and label many drives; what is finished is used, and what fails stops nothing.
+
+    Drives of one car (of the library, or --car) share a camera that is found from them together, if theirs
+    agree. Maps of one track (of the library, or --track) are joined.
+    """
+    from datagen.fleet.checksums import with_checksums
     from datagen.fleet.run import label_all as run
-    from datagen.fleet.run import with_checksums
     from datagen.fleet.storage import Storage
     from datagen.fleet.task import FleetSettings
     from datagen.settings import MapSettings
@@ -112,7 +129,15 @@ def label_all(
         settings = settings.model_copy(update={"map": load_settings(MapSettings, config)})
     if colour_weight is not None:
         settings = settings.model_copy(update={"colour_weight": colour_weight})
-    told = Told(lane_width, None if camera is None else _full(camera), wheelbase, camera_height, tape_width)
+    told = Told(
+        lane_width,
+        None if camera is None else _full(camera),
+        wheelbase,
+        camera_height,
+        tape_width,
+        car,
+        track,
+    )
     known = [] if library is None else drives_of_library(library, told)
     sources = [source for each in drives or () for source in found_in(each)]
     known += [told.drive(name, source) for name, source in named(sources, known).items()]
@@ -127,7 +152,14 @@ def label_all(
         checked = with_checksums(known, storage)
         with console.fleet_bar() as show:
             result = run(
-                checked, settings, storage, chosen, lambda counts: show(*astuple(counts)), refused_again
+                checked,
+                settings,
+                storage,
+                chosen,
+                lambda counts: show(*astuple(counts)),
+                refused_again=refused_again,
+                each_alone=each_alone,
+                find_tracks=find_tracks,
             )
         show_result(result, out)
 
@@ -162,6 +194,15 @@ def show_result(result: FleetResult, out: str) -> None:
         f"{len(left)} left; {new} done in this run"
     )
     console.show_problems([f"{found.drive.name}: {found.reason}" for found in (*refused, *failed, *twice)])
+    for car in result.cars:
+        with_it = f"found from {', '.join(car.from_drives)}" if car.camera else f"none for all: {car.reason}"
+        console.say(f"camera of {car.name}: {with_it}")
+        console.show_problems([f"{name} keeps its own camera: {why}" for name, why in car.own.items()])
+    for joint in result.tracks:
+        console.say(f"{joint.name}: {len(joint.joined)} of {counted(joint.count, 'map')} joined")
+        problems = [joint.reason] if joint.reason else []
+        problems += [f"{name} {why}" for name, why in joint.left_out.items()]
+        console.show_problems([*problems, *(f"laid anew: {text}" for text in joint.relaid)])
     again = "run the command again: what is finished is kept"
     if result.disk_full:
         raise LanenetError(f"{result.disk_full}; {counted(len(left), 'drive')} left; make room, then {again}")
@@ -177,11 +218,19 @@ class Told(NamedTuple):
     wheelbase_cm: float | None
     camera_height_cm: float | None
     tape_width_cm: float | None
+    car: str = ""
+    track: str = ""
 
     def drive(
-        self, name: str, source: str, lane_width_cm: float | None = None, camera: str | None = None
+        self,
+        name: str,
+        source: str,
+        lane_width_cm: float | None = None,
+        camera: str | None = None,
+        car: str | None = None,
+        track: str | None = None,
     ) -> FleetDrive:
-        """Return a drive that says so much of itself.
+        """Return a drive that says so much of itself; None for what it does not say.
 
         Raises:
             ConfigError: If its lane width is not known.
@@ -194,7 +243,18 @@ class Told(NamedTuple):
                 f"{source}: expected --lane-width: the distance in cm between the middles of the lane's two "
                 "lines"
             )
-        return FleetDrive(name, source, "", width_cm, camera or self.camera, *self[2:])
+        return FleetDrive(
+            name,
+            source,
+            "",
+            width_cm,
+            camera or self.camera,
+            self.wheelbase_cm,
+            self.camera_height_cm,
+            self.tape_width_cm,
+            self.car if car is None else car,
+            self.track if track is None else track,
+        )
 
 
 def drives_of_library(file: Path, told: Told) -> list[FleetDrive]:
@@ -213,7 +273,9 @@ def drives_of_library(file: Path, told: Told) -> list[FleetDrive]:
         camera = library.folder / entry.camera
         given = str(camera.resolve()) if entry.camera and camera.exists() else None
         path = str(library.path_of(entry).resolve())
-        drives.append(told.drive(entry.name, path, entry.lane_width_cm, given))
+        # A car may carry several cameras.
+        car = f"{entry.car}, camera {entry.camera}" if entry.car and entry.camera and not given else entry.car
+        drives.append(told.drive(entry.name, path, entry.lane_width_cm, given, car, entry.track))
     return drives
 
 

@@ -36,7 +36,14 @@ def sweep(
         data = prepare(settings.data, settings.work_folder, progress)
     with console.progress_bar("trials") as progress:
         table = sweep_networks(
-            settings.learn, data.train, data.validation, out, minutes * 60.0, trials, progress
+            settings.learn,
+            data.train,
+            data.validation,
+            out,
+            minutes * 60.0,
+            trials,
+            progress,
+            data.weights,
         )
     console.show_lines(table.splitlines()[:14])
     console.wrote(out / "sweep.md", out / "trials.csv")

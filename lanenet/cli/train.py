@@ -314,14 +314,14 @@ class _Run:
 
         # One folder per settings and data, so that a stopped run finds its own state.
         learn = self.settings.learn
-        run_hash = hash_run(learn, data.train, data.validation)
+        run_hash = hash_run(learn, data.train, data.validation, data.weights)
         folder: Path = self.settings.work_folder / f"train-{run_hash}"
         if read_finished(folder, run_hash) is not None:
             console.show_lines(["the network was trained before with these labels and settings: it is used"])
         elif (state := read_state(folder / STATE_NAME, run_hash)) is not None:
             console.show_lines([f"goes on after epoch {len(state.history)} of {learn.epochs}"])
         with console.training_bar() as progress:
-            train_network(learn, data.train, data.validation, folder, progress)
+            train_network(learn, data.train, data.validation, folder, progress, data.weights)
         return folder
 
     def _test(

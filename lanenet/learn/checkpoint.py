@@ -111,8 +111,20 @@ def best_record(history: Sequence[EpochRecord]) -> EpochRecord:
     return min(history, key=lambda r: math.inf if math.isnan(r.val_trimmed_cm) else r.val_trimmed_cm)
 
 
-def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]) -> str:
+def hash_run(
+    settings: LearnSettings,
+    train_paths: Sequence[Path],
+    val_paths: Sequence[Path],
+    set_weights: Sequence[float] = (),
+) -> str:
     """Return a hash of all that decides a run: version, settings, contents of the files, starting weights.
+
+    Args:
+        settings: How to train.
+        train_paths: Label sets to learn from.
+        val_paths: Label sets that choose the best epoch.
+        set_weights: How often each set to learn from is shown; none, or all alike, is another word for the
+            same.
 
     Raises:
         LabelFormatError: If a file cannot be read.
@@ -128,6 +140,8 @@ def hash_run(settings: LearnSettings, train_paths: Sequence[Path], val_paths: Se
         data += f" {len(train_paths)} {settings.memory_mb} MB"
     text = f"{_VERSION} {settings.hash} {data} {hash_files(weights)}"
     text += hash_of_start(settings.start_from)
+    if len(set(set_weights)) > 1:
+        text += f" {list(set_weights)}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

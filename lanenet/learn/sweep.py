@@ -118,6 +118,7 @@ def sweep(
     seconds: float,
     trials: int,
     progress: Progress | None = None,
+    set_weights: Sequence[float] = (),
 ) -> str:
     """Try networks until the time is up, and write the table of all trials.
 
@@ -132,6 +133,7 @@ def sweep(
         seconds: No trial runs longer than this after the start.
         trials: Finished trials at most, those of earlier calls included.
         progress: Called after each trial.
+        set_weights: How often each set to learn from is shown beside the others; none weighs all alike.
 
     Returns:
         The table, as Markdown.
@@ -153,7 +155,7 @@ def sweep(
     check_same(sets[0].meta, val_sets[0].meta, str(train_paths[0]), str(val_paths[0]))
     make_folder(out)
     study = _open_study(
-        optuna, out / DATABASE_NAME, hash_run(settings, train_paths, val_paths), settings.seed
+        optuna, out / DATABASE_NAME, hash_run(settings, train_paths, val_paths, set_weights), settings.seed
     )
     states = optuna.trial.TrialState
     finished = (states.COMPLETE, states.PRUNED)
@@ -161,7 +163,9 @@ def sweep(
         while (done := len(study.get_trials(states=finished))) < trials and time.monotonic() < deadline:
             trial = study.ask()
             window, chosen = _draw(trial, settings)
-            samples = LaneSamples([_seen_in(s, window) for s in sets], [str(p) for p in train_paths])
+            samples = LaneSamples(
+                [_seen_in(s, window) for s in sets], [str(p) for p in train_paths], weights=set_weights
+            )
             val = LaneSamples([_seen_in(s, window) for s in val_sets], [str(p) for p in val_paths])
             value = _try(trial, TrainingRun(chosen, samples), val, deadline)
             if value == _OUT_OF_TIME:

@@ -79,6 +79,7 @@ class _Job:
     val_paths: tuple[Path, ...]
     out: Path
     run_hash: str
+    set_weights: tuple[float, ...] = ()
 
 
 def train(
@@ -87,6 +88,7 @@ def train(
     val_paths: Sequence[Path],
     out: Path,
     progress: Progress | None = None,
+    set_weights: Sequence[float] = (),
 ) -> TrainResult:
     """Train, evaluate and export a network.
 
@@ -100,6 +102,7 @@ def train(
         val_paths: Label sets that choose the best epoch; other drives, or other laps.
         out: Checkpoint folder.
         progress: Called after each epoch.
+        set_weights: How often each set to learn from is shown beside the others; none weighs all alike.
 
     Returns:
         The checkpoint folder and the error of its model.
@@ -113,14 +116,14 @@ def train(
             processes ends before its time.
     """
     with lock_output(out):
-        run_hash = hash_run(settings, train_paths, val_paths)
+        run_hash = hash_run(settings, train_paths, val_paths, set_weights)
         metrics = read_finished(out, run_hash)
         if metrics is not None:
             let_go()
             return TrainResult(out, out / MODEL_NAME, metrics["best_epoch"], metrics["val_rmse_cm"], False)
         uses_gpu = _device(settings).type == "cuda"
         train_paths, val_paths = (tuple(p.absolute() for p in paths) for paths in (train_paths, val_paths))
-        job = _Job(settings, train_paths, val_paths, out.absolute(), run_hash)
+        job = _Job(settings, train_paths, val_paths, out.absolute(), run_hash, tuple(set_weights))
         with start_processes(settings.processes, uses_gpu, _take_part, job) as processes:
             return _train(job, out, processes, progress)
 
@@ -159,7 +162,7 @@ def _take_part(job: _Job, processes: Processes) -> None:
 def _open_run(job: _Job, processes: Processes) -> tuple[TrainingRun, Samples]:
     """Return a run at its beginning, or where it was stopped; and the validation samples."""
     saved = read_state(job.out / STATE_NAME, job.run_hash)
-    samples, val = _read_both(job.settings, job.train_paths, job.val_paths)
+    samples, val = _read_both(job)
     return TrainingRun(job.settings, samples, saved, processes), val
 
 
@@ -380,23 +383,25 @@ def running_mean(network: LaneNet, decay: float) -> AveragedModel:
     return mean
 
 
-def _read_both(
-    settings: LearnSettings, train_paths: Sequence[Path], val_paths: Sequence[Path]
-) -> tuple[Samples, Samples]:
+def _read_both(job: _Job) -> tuple[Samples, Samples]:
     """Read training and validation samples, or what streams of them need if they do not fit into memory."""
+    settings, train_paths, val_paths = job.settings, job.train_paths, job.val_paths
     shards = choose_stream(settings, train_paths, val_paths)
     if shards is not None:
-        return _open_streams(settings, *shards)
+        return _open_streams(settings, *shards, job.set_weights)
     train_sets = [read_labels(path) for path in train_paths]
     val_sets = [read_labels(path) for path in val_paths]
     _refuse_truth(train_paths, [labels.meta for labels in train_sets])
-    samples = LaneSamples(train_sets, [str(p) for p in train_paths], settings.min_quality)
+    names = [str(path) for path in train_paths]
+    samples = LaneSamples(train_sets, names, settings.min_quality, job.set_weights)
     val = LaneSamples(val_sets, [str(p) for p in val_paths])
     check_same(train_sets[0].meta, val_sets[0].meta, str(train_paths[0]), str(val_paths[0]))
     return samples, val
 
 
-def _open_streams(settings: LearnSettings, train: Shards, val: Shards) -> tuple[Samples, Samples]:
+def _open_streams(
+    settings: LearnSettings, train: Shards, val: Shards, set_weights: Sequence[float]
+) -> tuple[Samples, Samples]:
     """Open training samples as a stream, and validation samples too if a quarter of memory is too little."""
     _refuse_truth(train.paths, [index.meta for index in train.indices])
     memory = settings.memory_mb * MEBIBYTE
@@ -407,7 +412,7 @@ def _open_streams(settings: LearnSettings, train: Shards, val: Shards) -> tuple[
     else:
         # Not beside the training's windows: its epoch is over when the validation begins.
         chosen = StreamedSamples(val, memory)
-    samples = StreamedSamples(train, memory, settings.min_quality)
+    samples = StreamedSamples(train, memory, settings.min_quality, set_weights)
     check_same(train.indices[0].meta, val.indices[0].meta, str(train.paths[0]), str(val.paths[0]))
     return samples, chosen
 

@@ -73,11 +73,16 @@ class Samples(ABC):
             the network is for any calibrated camera.
         reference: Where the labels come from: ``truth``, ``map`` or ``map and truth``.
         set_start: Set i owns the frames ``set_start[i]`` to ``set_start[i + 1]``.
-        weights: How often each set is shown, see :meth:`shown`.
+        weights: How often each set is shown beside the others, see :meth:`shown`.
     """
 
     def __init__(
-        self, metas: Sequence[LabelMeta], names: Sequence[str], kept: Sequence[int], least_quality: float
+        self,
+        metas: Sequence[LabelMeta],
+        names: Sequence[str],
+        kept: Sequence[int],
+        least_quality: float,
+        weights: Sequence[float] = (),
     ) -> None:
         """Describe what the sets share.
 
@@ -86,6 +91,7 @@ class Samples(ABC):
             names: Where each set came from, for messages.
             kept: Frames of each set that are used.
             least_quality: That these have, for messages.
+            weights: Of each set; none weighs all alike.
 
         Raises:
             LabelFormatError: If there is no set, no frame is left, or two sets cannot be learned together.
@@ -100,7 +106,7 @@ class Samples(ABC):
         self.perception = first.perception if same else first.perception.of_all_rows()
         self.reference = " and ".join(sorted({meta.source for meta in metas}))
         self.set_start: Int[np.ndarray, "_"] = np.concatenate([[0], np.cumsum(kept)])
-        self.weights: tuple[float, ...] = (1.0,) * len(metas)
+        self.weights = tuple(weights) or (1.0,) * len(metas)
         if not self.set_start[-1]:
             raise LabelFormatError(
                 f"{', '.join(names)}: no frame has a label and a quality of at least {least_quality:g}"
@@ -178,16 +184,25 @@ class Samples(ABC):
         """Number of samples of a batch of an epoch, all parts together."""
         return min(batch_size, len(self) - step * batch_size)
 
-    def shown(self, balance: Balance) -> list[tuple[int, int]]:
-        """Return the sets that have frames, and how many samples of each an epoch shows.
+    def each_once(self, balance: Balance) -> bool:
+        """Tell whether an epoch shows every frame once."""
+        return balance == "none" and len(set(self.weights)) == 1
 
-        An epoch has as many samples as there are frames. ``drive`` shows each label set equally often, and a
-        frame again only after all others of its set.
+    def shown(self, balance: Balance) -> list[tuple[int, int]]:
+        """Return the sets that an epoch shows, and how many samples of each.
+
+        An epoch has as many samples as there are frames. ``drive`` shows each label set as often as its
+        weight says, whatever its length, ``none`` each of its frames; a frame is shown again only after all
+        others of its set.
         """
-        filled = [k for k, size in enumerate(np.diff(self.set_start)) if size]
-        # The first sets get the remainder of the division.
-        each, more = divmod(len(self), len(filled))
-        return [(k, each + (place < more)) for place, k in enumerate(filled)]
+        sizes = np.diff(self.set_start)
+        share = np.array(self.weights) * (sizes > 0 if balance == "drive" else sizes)
+        exact = len(self) * share / share.sum()
+        counts = np.floor(exact).astype(np.int64)
+        # What is left goes to those that lack most of a sample, the first sets first.
+        left = len(self) - int(counts.sum())
+        counts[np.argsort(counts - exact, kind="stable")[:left]] += 1
+        return [(k, int(count)) for k, count in enumerate(counts) if count]
 
 
 class LaneSamples(Samples):
@@ -198,7 +213,11 @@ class LaneSamples(Samples):
     """
 
     def __init__(
-        self, label_sets: Sequence[LabelSet], names: Sequence[str], min_quality: float = 0.0
+        self,
+        label_sets: Sequence[LabelSet],
+        names: Sequence[str],
+        min_quality: float = 0.0,
+        weights: Sequence[float] = (),
     ) -> None:
         """Join label sets.
 
@@ -206,13 +225,14 @@ class LaneSamples(Samples):
             label_sets: Returned by :func:`read_labels`.
             names: Where each set came from, for messages.
             min_quality: Frames of a lower quality are left out, and so are frames without any label.
+            weights: How often each set is shown, see :meth:`Samples.shown`; none weighs all alike.
 
         Raises:
             LabelFormatError: If there is no set, no frame is left, or two sets cannot be learned together.
         """
         kept = [usable(labels.points_cm, labels.quality, min_quality) for labels in label_sets]
         metas = [labels.meta for labels in label_sets]
-        super().__init__(metas, names, [len(rows) for rows in kept], min_quality)
+        super().__init__(metas, names, [len(rows) for rows in kept], min_quality, weights)
         self.frames = concat_frames(
             [frames_of(labels.subset(rows)) for labels, rows in zip(label_sets, kept, strict=True)]
         )
@@ -264,12 +284,12 @@ class LaneSamples(Samples):
         Args:
             seed: Of the run.
             epoch: Counted from 0.
-            balance: See :meth:`shown`; ``none`` shows each frame once.
+            balance: See :meth:`shown`; ``none`` shows each frame once if all sets weigh the same.
         """
         n = len(self)
         # A stream of its own: the number after the last sample's.
         rng = np.random.default_rng((seed, epoch, n))
-        if balance == "none":
+        if self.each_once(balance):
             frames = rng.permutation(n)
             return frames, frames
         shown, streams = [], []

@@ -112,13 +112,16 @@ class _Piece(NamedTuple):
 class StreamedSamples(Samples):
     """The frames of label sets that do not fit into memory together."""
 
-    def __init__(self, shards: Shards, memory_bytes: int, min_quality: float = 0.0) -> None:
+    def __init__(
+        self, shards: Shards, memory_bytes: int, min_quality: float = 0.0, weights: Sequence[float] = ()
+    ) -> None:
         """Read which frames can be used.
 
         Args:
             shards: The label sets.
             memory_bytes: What samples may take in memory.
             min_quality: Frames of a lower quality are left out, and so are frames without any label.
+            weights: How often each set is shown, see :meth:`shown`; none weighs all alike.
 
         Raises:
             LabelFormatError: As :class:`LaneSamples`, and if a row group alone is larger than a window.
@@ -143,7 +146,9 @@ class StreamedSamples(Samples):
         self._group_start: Int[np.ndarray, "_"] = np.concatenate([[0], np.cumsum(kept)])
         sizes = np.bincount(self._group_set, weights=kept, minlength=len(counts)).astype(np.int64)
         names = [str(path) for path in shards.paths]
-        super().__init__([index.meta for index in shards.indices], names, sizes.tolist(), min_quality)
+        super().__init__(
+            [index.meta for index in shards.indices], names, sizes.tolist(), min_quality, weights
+        )
 
     def _place(self, group: int) -> tuple[Path, int]:
         """File of a row group, and its number there."""
@@ -254,7 +259,7 @@ class StreamedSamples(Samples):
 
     def _visits(self, rng: np.random.Generator, balance: Balance) -> Int[np.ndarray, "v 3"]:
         """Return which groups an epoch visits: group, how often it was visited before, and samples of it."""
-        if balance == "none":
+        if self.each_once(balance):
             groups = np.flatnonzero(self._kept)
             return np.stack([groups, np.zeros_like(groups), self._kept[groups]], axis=1)
         visits = []

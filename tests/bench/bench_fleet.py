@@ -23,10 +23,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.engine import Ended, Engine, Task
 from datagen.fleet.local_engine import LocalEngine
 from datagen.fleet.ray_engine import RayEngine
-from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.run import label_all
 from datagen.fleet.storage import RESULT_NAME, Storage
 from datagen.fleet.task import LABELS, MAPS, FleetDrive, FleetSettings
 from datagen.world.simulate import simulate_drive

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
+from recordings import lap, write_recording
 
 from lanenet.cli.train import run_settings_schema
 from lanenet.config import check_settings, load_settings, read_yaml
@@ -176,6 +178,26 @@ def test_the_data_of_a_training_run_is_made(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepare_quickly(path, tmp_path, monkeypatch)
+
+
+def test_make_trains_the_general_network_with_the_real_drives_of_a_library(tmp_path: Path) -> None:
+    """One config: what make adds to it is read, and lists the drives beside the simulated ones."""
+    from datagen.datasets.from_library import with_library
+    from lanenet.data.library import Library
+
+    library = Library.open(tmp_path / "drives.sqlite", create=True)
+    for seed, (name, licence) in enumerate({"hall": "MIT", "yard": "CC0-1.0"}.items()):
+        drive = write_recording(tmp_path / name, lap(seed, 40))
+        library.add(drive, track=name, licence=licence, lane_width_cm=40.0)
+    words = ["general", f"LIBRARY={library.path}", "GENERAL=data.library.split=train data.library.weight=0.3"]
+    command = ["make", "--dry-run", "--no-print-directory", "--assume-old=.venv/.stamp-train", *words]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=CONFIGS.parent).stdout
+    config, *overrides = said.replace("\\\n", " ").partition("lanenet train")[2].split()
+    settings: Any = load_settings(run_settings_schema(), CONFIGS.parent / config, overrides)
+    assert settings.name == "general-real" and settings.data.synthetic.train == 700
+    data, _ = with_library(settings.data)
+    found = [(drive.track, drive.licence, drive.split, drive.weight) for drive in data.drives]
+    assert found == [("hall", "MIT", "train", 0.3), ("yard", "CC0-1.0", "train", 0.3)]
 
 
 #: The others are trained by `make chain`, a stage of the gate.

@@ -13,11 +13,13 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
+#: The commit that brought the weights, which only the repository knows.
+ADDED = "0b26523b02ab"
 KEPT = ("run.yaml", "metrics.json", "results.json", "MODEL_CARD.md", "camera.yaml")
 
 
 def written(folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "contrib" / "data_sheet.py"), str(folder)]
+    command = [sys.executable, str(ROOT / "contrib" / "data_sheet.py"), str(folder), "--added", ADDED]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
 
 
@@ -30,6 +32,9 @@ def test_the_sheet_of_the_general_network_can_be_written_again(tmp_path):
     for name in ("DATA_SHEET.md", "data_sheet.json"):
         assert (tmp_path / name).read_text() == (shipped / name).read_text()
     sheet = json.loads((tmp_path / "data_sheet.json").read_text())
+    # 62042 frames at 20 a second.
+    assert sheet["parts"]["train"]["minutes"] == pytest.approx(62042 / 20 / 60)
+    assert f"its weights came with commit {ADDED}" in sheet["notes"][0]
     # Five cameras take turns.
     assert [camera["drives"] for camera in sheet["simulated"]["cameras"]] == [280, 140, 140, 140]
     # Settings of other drives are noticed.

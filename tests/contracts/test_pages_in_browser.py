@@ -15,8 +15,9 @@ import pytest
 from chromium import PHONE_PX, Seen, see, take_screenshot
 from fleet_work import HereEngine
 
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.page import FLEET_PAGE_NAME
-from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.run import label_all
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import FleetDrive, FleetSettings
 from datagen.judge.contest import judge

@@ -10,18 +10,21 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from fleet_drives import sixty_drives
+from fleet_drives import cut_tub, sixty_drives
 
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.local_engine import LocalEngine
 from datagen.fleet.ray_engine import RayEngine
-from datagen.fleet.run import Counts, label_all, with_checksums
+from datagen.fleet.run import label_all
+from datagen.fleet.stage import Counts
 from datagen.fleet.storage import RESULT_NAME, Storage
-from datagen.fleet.task import FleetSettings
+from datagen.fleet.task import FleetDrive, FleetSettings
 
 pytestmark = pytest.mark.slow
 
 #: How often a machine is killed, and the seed of when and which.
 KILLS, SEED = 3, 26
+KINDS = ("maps", "labels", "cameras", "tracks")
 
 
 class TwoMachines:
@@ -54,8 +57,11 @@ def machines(monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoMachines]:
 
 def contents(out: Path) -> dict[str, bytes]:
     """Return what was made, by path; not the markers, which tell when and where."""
-    files = [path for kind in ("maps", "labels") for path in (out / kind).rglob("*") if path.is_file()]
-    return {str(path.relative_to(out)): path.read_bytes() for path in files if path.name != RESULT_NAME}
+    files = [path for kind in KINDS for path in (out / kind).rglob("*") if path.is_file()]
+    # Joined maps name those that they were made from by their place, and the marker of a map the file of its
+    # camera by place and time.
+    other = (RESULT_NAME, "joined.yaml", "map.done.json")
+    return {str(path.relative_to(out)): path.read_bytes() for path in files if path.name not in other}
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -105,3 +111,29 @@ def test_sixty_drives_on_two_machines_of_which_three_are_killed(
     said = f"60 drives, {dict(verdicts)}: {took_s:.0f} s with {KILLS} kills; again {again_s:.2f} s"
     with capsys.disabled():
         print(f"\n{said}")  # noqa: T201
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_the_camera_of_a_car_and_the_map_of_a_track_are_the_same_from_processes_and_from_ray(
+    shared_data: Path, tmp_path: Path
+):
+    told = {"wheelbase_cm": 17.0, "car": "red", "track": "garage"}
+    drives = []
+    for name, first in (("monday", 0), ("tuesday", 750)):
+        cut = cut_tub(shared_data / "garage_tape", tmp_path / "drives" / name, first, 600)
+        drives.append(FleetDrive(name, str(cut), "", 31.0, **told))
+    results = []
+    for name, engine in (("local", LocalEngine(2)), ("ray", RayEngine(None, 2))):
+        storage = Storage(str(tmp_path / name))
+        checked = with_checksums(drives, storage)
+        results.append(label_all(checked, FleetSettings(), storage, engine))
+        again = label_all(checked, FleetSettings(), storage, engine)
+        assert not any(drive.new for drive in again.drives)
+    local, on_ray = results
+    (car,), (track,) = local.cars, local.tracks
+    assert set(car.from_drives) == {"monday", "tuesday"} and not car.own
+    assert track.joined == ("monday", "tuesday") and not track.left_out and not track.relaid
+    assert [drive.verdict for drive in local.drives] == [drive.verdict for drive in on_ray.drives]
+    assert [drive.map_key for drive in local.drives] == [drive.map_key for drive in on_ray.drives]
+    assert on_ray.tracks == local.tracks
+    assert contents(tmp_path / "local") == contents(tmp_path / "ray")

@@ -9,14 +9,24 @@ from typing import Any
 import pytest
 from drives import write_drive
 from fleet_work import HereEngine
+from small_map import CAMERA
 from typer.testing import CliRunner
 
 from datagen.fleet import work
 from datagen.fleet.local_engine import LocalEngine
 from datagen.fleet.ray_engine import RayEngine
+from datagen.fleet.result import CarFound, FleetResult, TrackFound
 from datagen.fleet.task import FleetDrive
 from lanenet.cli.app import app
-from lanenet.cli.label_all import EngineName, Told, drives_of_library, engine_of, found_in, named
+from lanenet.cli.label_all import (
+    EngineName,
+    Told,
+    drives_of_library,
+    engine_of,
+    found_in,
+    named,
+    show_result,
+)
 from lanenet.data.library import Library
 from lanenet.errors import ConfigError, TrackingLostError
 
@@ -92,10 +102,33 @@ def test_drives_of_a_library(tmp_path: Path):
     write_drive(tmp_path / "two", n=7)
     library.add(tmp_path / "one", name="first", lane_width_cm=35.0, camera=str(camera))
     library.add(tmp_path / "two", camera="a name")
-    assert drives_of_library(library.path, TOLD) == [
+    write_drive(tmp_path / "three", n=8)
+    library.add(tmp_path / "three", camera="wide", car="red", track="hall")
+    # A car or a track of the command is that of the drives that it lists.
+    assert drives_of_library(library.path, TOLD._replace(car="blue", track="yard")) == [
         FleetDrive("first", str(tmp_path / "one"), "", 35.0, str(camera), 26.0),
+        FleetDrive(
+            "three", str(tmp_path / "three"), "", 40.0, None, 26.0, car="red, camera wide", track="hall"
+        ),
         FleetDrive("two", str(tmp_path / "two"), "", 40.0, None, 26.0),
     ]
+
+
+def test_drives_that_are_listed_have_the_car_and_the_track_of_the_command(tmp_path: Path):
+    drive = TOLD._replace(car="red", track="hall").drive("tub", str(write_drive(tmp_path / "tub")))
+    assert (drive.car, drive.track) == ("red", "hall")
+
+
+def test_cars_and_tracks_are_told(capsys: pytest.CaptureFixture[str]):
+    own = {"c": "another camera than that of a: 9.0 px in the image"}
+    car = CarFound("red", ("a", "b", "c"), "key", from_drives=("a", "b"), own=own, camera=CAMERA)
+    track = TrackFound("hall", 3, "key", ("a", "b", "c"), ("a", "b"), {"c": "is of another track"}, 40.0)
+    none = TrackFound("yard", 2, "key", ("x", "y"), reason="no two of 2 maps are joined")
+    show_result(FleetResult((), cars=(car,), tracks=(track, none)), "out")
+    said = "".join(capsys.readouterr())
+    assert "camera of red: found from a, b" in said and "c keeps its own camera: another camera" in said
+    assert "hall: 2 of 3 maps joined" in said and "c is of another track" in said
+    assert "yard: 0 of 2 maps joined" in said and "no two of 2 maps are joined" in said
 
 
 def test_names_are_unique():

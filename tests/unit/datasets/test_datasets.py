@@ -199,12 +199,18 @@ def test_a_recording_counts_as_many_drives_to_learn_from(tmp_path, monkeypatch):
     monkeypatch.setattr("datagen.datasets.jobs.label_map", lambda _, out, **__: write_labels(out, whole))
     whole = _labels(np.arange(400))
     (tmp_path / "tub").mkdir()
-    drives = (RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0, counts_as=3),)
+    drives = (RecordedSettings(path=tmp_path / "tub", lane_width_cm=40.0, counts_as=3, weight=0.3),)
     # A recording alone needs no other process, nor does it leave one idle that could compile.
     given: list[Path] = []
     found = prepare(DataSettings(drives=drives, workers=2), tmp_path / "work", last=given.append)
     assert not given
     assert len(found.train) == 3 and len(set(found.train)) == 1
+    assert found.weights == [0.3] * 3
+    # Another weight makes no other labels.
+    made = found.train[0].stat().st_mtime_ns
+    again = drives[0].model_copy(update={"weight": 2.0})
+    found = prepare(DataSettings(drives=(again,), workers=2), tmp_path / "work")
+    assert found.weights == [2.0] * 3 and found.train[0].stat().st_mtime_ns == made
     assert len(found.validation) == len(found.of("test")) == 1
 
 

@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 from recordings import lap, write_recording
 
-from datagen.datasets.build import check_leaks
+from datagen.datasets.build import check_leaks, recorded_jobs
 from datagen.datasets.from_library import _labelled, parts_of_tracks, with_library
 from datagen.datasets.settings import DataSettings, LibrarySettings
 from datagen.fleet.result import INDEX_NAME, FleetResult, Labelled, _index
+from datagen.fleet.source import checksum
 from datagen.fleet.task import FleetDrive
 from lanenet.data.files import write_json
 from lanenet.data.library import Library
@@ -43,6 +44,11 @@ def test_all_drives_of_a_track_are_in_one_part(library: Library, tmp_path: Path)
         "c": ("validation", "club"),
     }
     assert {(drive.licence, drive.car) for drive in data.drives} == {("CC0-1.0", "red")}
+    whole, given = with_library(_data(library, split="train"))
+    assert {drive.split for drive in whole.drives} == {"train"}
+    assert given == ["train: 4 drives of the tracks club, hall, yard"]
+    often, _ = with_library(_data(library, weight=0.3, counts_as=15))
+    assert {(drive.weight, drive.counts_as) for drive in often.drives} == {(0.3, 15)}
     assert data.library is None and with_library(data) == (data, [])
     assert "test: 2 drives of the tracks hall" in lines
     assert check_leaks(data, tmp_path / "work") == ()
@@ -67,7 +73,7 @@ def test_what_label_all_made_is_used_and_what_it_refused_is_left_out(
     library: Library, tmp_path: Path
 ) -> None:
     def labelled(name: str, verdict: str, reason: str = "") -> Labelled:
-        drive = FleetDrive(name, str(tmp_path / name), "", 40.0, None, None, None, None)
+        drive = FleetDrive(name, str(tmp_path / name), checksum(str(tmp_path / name)), 40.0)
         return Labelled(drive, verdict, reason, True, f"map-{name}", f"labels-{name}", {}, {})
 
     found = FleetResult(
@@ -84,6 +90,17 @@ def test_what_label_all_made_is_used_and_what_it_refused_is_left_out(
         tmp_path / "out" / "maps" / f"map-{name}" for name in ("a1", "b", "c")
     ]
     assert lines[0] == "left out: a2: stands still"
+    # Messages name drives as the library does, not by the keys of their maps.
+    assert [job.title for job in recorded_jobs(data, tmp_path / "work")] == ["a1", "b", "c"]
+    assert data.known_drives == library.path
+    # A drive that has other frames by now is not what was labelled.
+    image = next((tmp_path / "b").rglob("*.jpg"))
+    before = image.read_bytes()
+    image.write_bytes(before + b"more")
+    _, lines = _labelled(tmp_path / "out", {"b": tmp_path / "b", "c": tmp_path / "c"})
+    assert lines == ["left out: b: its files have changed since it was labelled; label it again"]
+    image.write_bytes(before)
+    assert _labelled(tmp_path / "out", {"b": tmp_path / "b"})[1] == []
     # Another drive that has the name of one by now, on another track, has no map yet.
     paths, lines = _labelled(tmp_path / "out", {"b": tmp_path / "b", "c": tmp_path / "new"})
     assert list(paths) == ["b"] and len(lines) == 1

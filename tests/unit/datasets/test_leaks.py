@@ -18,7 +18,9 @@ from datagen.datasets import leaks
 from datagen.datasets.build import check_leaks, prepare
 from datagen.datasets.settings import ROLES, DataSettings, RecordedSettings
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
+from lanenet.data.library import Library
 from lanenet.data.maps.folder import read_map, write_map
+from lanenet.data.maps.joined import FORMAT, JoinedDrive, JoinedMeta, write_joined
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 
@@ -103,6 +105,52 @@ def test_a_map_whose_recording_is_gone_is_named(drives: dict[str, Path], tmp_pat
     run = _run({"path": drive_map, "lane_width_cm": 36.0}, {"path": drives["whole"]}, {"path": drives["lap"]})
     (said,) = check_leaks(run, tmp_path / "work")
     assert str(drive_map) in said and "gone is not here" in said
+
+
+def test_a_library_is_asked_for_a_recording_that_has_moved(tmp_path: Path) -> None:
+    pictures = lap(1, int(small_map().frames[-1]) + 60)
+    used = write_recording(tmp_path / "used", pictures)
+    again = write_recording(tmp_path / "again", pictures)
+    drive_map = _map_of(used, tmp_path / "map")
+    library = Library.open(tmp_path / "known.sqlite", create=True)
+    library.add(used, name="hall_monday", lane_width_cm=40.0)
+    used.rename(tmp_path / "moved")
+    run = _run({"path": drive_map, "lane_width_cm": 36.0, "split": "train"}, {"path": again})
+    (said,) = check_leaks(run, tmp_path / "work")
+    assert "used is not here" in said
+    asked = run.model_copy(update={"known_drives": library.path})
+    with pytest.raises(ConfigError, match=r"map is a cut of \S*again"):
+        check_leaks(asked, tmp_path / "work")
+    # By the name of the library, where that was moved with its drives.
+    elsewhere = _map_of(tmp_path / "other" / "place", tmp_path / "map")
+    named = {"path": elsewhere, "lane_width_cm": 36.0, "split": "train", "name": "hall_monday"}
+    with pytest.raises(ConfigError, match="hall_monday"):
+        check_leaks(
+            _run(named, {"path": again}).model_copy(update={"known_drives": library.path}),
+            tmp_path / "work",
+        )
+    # One that the library does not know stays unknown, and one in the same part is no leak.
+    whole = run.drives[1].model_copy(update={"split": "train"})
+    apart = asked.model_copy(update={"drives": (run.drives[0], whole)})
+    assert check_leaks(apart, tmp_path / "work") == ()
+
+
+def test_maps_that_were_joined_are_of_one_track_also_if_they_are_listed_one_by_one(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        _map_of(write_recording(tmp_path / name, lap(len(name), 80)), tmp_path / "track" / name)
+    place = {"x_cm": 0.0, "y_cm": 0.0, "turn_rad": 0.0, "scale": 1.0, "opposite": False}
+    members = tuple(JoinedDrive(map=n, made_from=n, **place) for n in ("monday", "tuesday"))
+    write_joined(tmp_path / "track", JoinedMeta(format=FORMAT, shared_camera=True, drives=members))
+    alone = [{"path": tmp_path / "track" / name, "lane_width_cm": 36.0} for name in ("monday", "tuesday")]
+    for splits in (("train", "test"), ("time", "time")):
+        run = _run(*({**one, "split": split} for one, split in zip(alone, splits, strict=True)))
+        with pytest.raises(ConfigError, match=r"monday .* and .*tuesday .* are both joined in \S*track"):
+            check_leaks(run, tmp_path / "work")
+    together = _run(*({**one, "split": "train"} for one in alone))
+    assert check_leaks(together, tmp_path / "work") == ()
+    # The folder as a whole is one road, which may be split as that of one drive.
+    folder = _run({"path": tmp_path / "track", "lane_width_cm": 36.0, "split": "time"})
+    assert check_leaks(folder, tmp_path / "work") == ()
 
 
 def _labels(out: Path, seed: int, rows: slice) -> Path:

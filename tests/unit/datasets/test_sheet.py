@@ -125,11 +125,16 @@ def test_a_recorded_drive_has_its_licence_from_the_library_and_the_rest_from_map
     assert entry["camera"]["width_px"] == mapped.camera.width
     text = sheet_files(sheet())["DATA_SHEET.md"]
     assert f"licence: {UNKNOWN}; car: {UNKNOWN}; track: {UNKNOWN}" in text
+    assert f"| {UNKNOWN} | 1 | " in text
     # The drive says something itself, and the library more.
     with (drive / "drive.yaml").open("a") as file:
         file.write("licence: CC0-1.0\n")
     (entry,) = sheet()["recorded"]
     assert (entry["licence"], entry["car"]) == ("CC0-1.0", None)
+    (total,) = sheet()["licences"].values()
+    assert list(sheet()["licences"]) == ["CC0-1.0"] and total["drives"] == 1
+    assert total["km"] == pytest.approx(0.01) and total["frames"] == entry["parts"]["train"]["frames"]
+    assert f"| CC0-1.0 | 1 | {total['frames']} | " in sheet_files(sheet())["DATA_SHEET.md"]
     # A config says more, as one that was drawn from a library at another place.
     told = {"licence": "MIT", "car": "blue", "track": "yard"}
     said = replace(job, recording=job.recording.model_copy(update=told))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from drives import write_drive
 
-from datagen.fleet.memory import memory_bytes, stated_bytes
+from datagen.fleet.memory import memory_bytes, memory_together, stated_bytes
 from datagen.fleet.meter import Meter
 
 
@@ -31,6 +31,12 @@ def test_a_drive_states_what_its_frames_take(tmp_path: Path):
     # One that cannot be read is refused soon; one elsewhere is not small.
     (tmp_path / "empty").mkdir()
     assert memory_bytes(str(tmp_path / "empty")) == stated_bytes(0, 0)
+
+
+def test_drives_that_are_in_memory_together_share_the_program(tmp_path: Path):
+    drives = [str(write_drive(tmp_path / name, n=n)) for name, n in (("a", 5), ("b", 7))]
+    assert memory_together(drives) == stated_bytes(12, 64 * 48)
+    assert memory_together(drives[:1]) == memory_bytes(drives[0])
 
 
 def test_a_meter_counts_time_and_the_peak_since_it_was_made():

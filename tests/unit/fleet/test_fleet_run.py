@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import math
 import shutil
 import uuid
 from collections.abc import Callable, Generator, Sequence
@@ -14,98 +12,19 @@ from typing import Any
 
 import fsspec
 import pytest
+from fleet_runs import SETTINGS, copy_of, drives_of, labels_in, run
 from fleet_work import HereEngine
 
 from datagen.fleet import work
+from datagen.fleet.checksums import with_checksums
 from datagen.fleet.engine import Ended, Task
-from datagen.fleet.local_engine import LocalEngine
-from datagen.fleet.result import FleetResult
-from datagen.fleet.run import label_all, with_checksums
+from datagen.fleet.run import label_all
 from datagen.fleet.source import checksum
 from datagen.fleet.storage import Storage
-from datagen.fleet.task import FleetDrive, FleetSettings
+from datagen.fleet.task import FleetSettings
 from datagen.fleet.work import Outcome
 from datagen.settings import MapSettings
-from datagen.world.simulate import simulate_drive
-from datagen.world.world import SimulationSettings
 from lanenet.data.label_set import read_labels
-from lanenet.errors import LanenetError, TrackingLostError
-
-SETTINGS = FleetSettings(map=MapSettings(find_bumper=False))
-LANE_CM = 40.0
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated drive that is just long enough."""
-    camera = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
-    track = {"left": {}, "right": {}, "interruptions_per_m": 0.0}
-    settings = {"seed": 1, "frames": 70, "camera": camera, "track": track}
-    folder = tmp_path_factory.mktemp("drives") / "tiny"
-    return simulate_drive(SimulationSettings.model_validate(settings), folder)
-
-
-def drives_of(*paths: Path | str, names: tuple[str, ...] = ()) -> list[FleetDrive]:
-    named = names or tuple(Path(path).name for path in paths)
-    return [FleetDrive(name, str(path), "", LANE_CM) for name, path in zip(named, paths, strict=True)]
-
-
-def run(
-    out: Path | str, drives: list[FleetDrive], settings: FleetSettings = SETTINGS, **more: Any
-) -> tuple[FleetResult, list[str]]:
-    """Label drives in this process; returns the result and the names of the tasks."""
-    storage, engine = Storage(str(out)), HereEngine()
-    return label_all(with_checksums(drives, storage), settings, storage, engine, **more), engine.names
-
-
-@pytest.fixture(scope="module")
-def labelled(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The storage of the tiny drive, labelled by a process of its own."""
-    out = tmp_path_factory.mktemp("labelled") / "out"
-    storage = Storage(str(out))
-    result = label_all(with_checksums(drives_of(tiny), storage), SETTINGS, storage, LocalEngine(1))
-    assert [drive.verdict for drive in result.drives] == ["good"]
-    return out
-
-
-@pytest.fixture
-def mapping(monkeypatch: pytest.MonkeyPatch, labelled: Path) -> list[str]:
-    """Instead of mapping, copy the tiny drive's map, or fail as the drive's name says; notes the names."""
-    (ready,) = (labelled / "maps").iterdir()
-    mapped: list[str] = []
-
-    def copy(request: Any, settings: Any, out: Path, **_: Any) -> Any:
-        name = request.drive_path.name
-        mapped.append(name)
-        if "lost" in name:
-            raise TrackingLostError(f"{request.drive_path}: the car stands still")
-        if "bug" in name:
-            raise ZeroDivisionError("by zero")
-        if "memory" in name:
-            raise MemoryError
-        if "full" in name:
-            raise LanenetError(f"{out}: cannot be written") from OSError(errno.ENOSPC, "No space left")
-        shutil.copytree(ready, out, dirs_exist_ok=True)
-        verdict = {"reasons": ["as good as it looks"]}
-        if "reject" in name:
-            report = json.loads((out / "report.json").read_text())
-            report["verdict"] |= {"grade": "reject", "sentence": "the lines are not where they seem"}
-            (out / "report.json").write_text(json.dumps(report))
-        return type("Report", (), {"figures": {"verdict": verdict}})()
-
-    monkeypatch.setattr(work, "map_drive", copy)
-    return mapped
-
-
-def copy_of(tiny: Path, path: Path) -> Path:
-    """Copy a drive and make it another one."""
-    shutil.copytree(tiny, path)
-    (path / "note.txt").write_text(path.name)
-    return path
-
-
-def labels_in(out: Path) -> dict[str, bytes]:
-    return {path.parent.name: path.read_bytes() for path in out.glob("labels/*/labels.parquet")}
 
 
 def test_a_drive_becomes_a_map_and_a_label_set(tiny: Path, labelled: Path):
@@ -312,7 +231,7 @@ def test_files_are_read_again_only_if_they_changed(
     drive, storage = copy_of(tiny, tmp_path / "tub"), Storage(str(tmp_path / "out"))
     read: list[str] = []
     monkeypatch.setattr(
-        "datagen.fleet.run.checksum", lambda source: (read.append(source), checksum(source))[1]
+        "datagen.fleet.checksums.checksum", lambda source: (read.append(source), checksum(source))[1]
     )
     (first,) = with_checksums(drives_of(drive), storage)
     assert with_checksums(drives_of(drive), storage) == [first] and read == [str(drive)]

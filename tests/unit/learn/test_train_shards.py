@@ -68,6 +68,9 @@ def test_the_memory_decides_a_run_only_where_it_is_too_small(data):
     assert choose_stream(large, *data) is None
     assert hash_run(large, *data) == hash_run(larger, *data) != hash_run(SETTINGS, *data)
     assert hash_run(SETTINGS, *data) != hash_run(SETTINGS, data[0][:2], data[1])
+    # How often the sets are shown decides the run; that all are shown alike is no news.
+    even, uneven = [2.0] * len(data[0]), [0.3, *([1.0] * (len(data[0]) - 1))]
+    assert hash_run(SETTINGS, *data) == hash_run(SETTINGS, *data, even) != hash_run(SETTINGS, *data, uneven)
 
 
 def test_places_are_a_label_set_without_what_it_shows(data):

@@ -132,6 +132,26 @@ def test_balance_shows_every_drive_equally_often():
     np.testing.assert_array_equal(plain, numbers)
 
 
+@pytest.mark.parametrize(
+    ("balance", "weights", "shown"),
+    [
+        ("none", (1.0, 1.0, 1.0), [90, 7, 3]),
+        ("none", (2.5, 2.5, 2.5), [90, 7, 3]),
+        # 27, 7 and 3 of 37.
+        ("none", (0.3, 1.0, 1.0), [73, 19, 8]),
+        ("drive", (0.5, 1.0, 0.5), [25, 50, 25]),
+        ("drive", (1e-3, 1.0, 1.0), [0, 50, 50]),
+    ],
+)
+def test_sets_are_shown_as_often_as_their_weights_say(balance, weights, shown):
+    sets = [make_label_set(n, n) for n in (90, 7, 3)]
+    data = LaneSamples(sets, ["a", "b", "c"], weights=weights)
+    order, streams = data.order(0, 4, balance)
+    found = np.bincount(np.searchsorted(data.set_start, order, side="right") - 1, minlength=3)
+    np.testing.assert_array_equal(found, shown)
+    assert len(order) == 100 and len(np.unique(streams)) == 100
+
+
 def test_an_epoch_can_be_left_early():
     batches = samples().epoch(AugmentSettings(), 0, 0, 8)
     next(batches)

@@ -156,6 +156,20 @@ def test_a_set_that_counts_as_several_drives_is_shown_as_often(files, source, ba
     assert len(np.unique(changed.reshape(len(sets), -1), axis=0)) == len(sets)
 
 
+@pytest.mark.parametrize("balance", ["none", "drive"])
+def test_weights_show_a_stream_as_often_as_sets_in_memory(files, balance):
+    weights = (0.3, 2.0, 1.0)
+    shards, labels = read_shards(files), [read_labels(path) for path in files]
+    stream = StreamedSamples(shards, 2**40, 0.5, weights)
+    whole = LaneSamples(labels, [str(path) for path in files], 0.5, weights)
+    assert stream.shown(balance) == whole.shown(balance)
+    batches, _ = numbered(stream, balance)
+    flat = np.array([k for batch in batches for k in batch])
+    counts = np.bincount(np.searchsorted(stream.set_start, flat, side="right") - 1, minlength=3)
+    assert [(k, n) for k, n in enumerate(counts.tolist()) if n] == whole.shown(balance)
+    assert counts.sum() == len(stream) and counts.tolist() != np.diff(stream.set_start).tolist()
+
+
 def test_no_more_is_in_memory_than_a_window_and_the_next(files):
     stream = streamed(files, groups=3)
     windows = stream.windows(1, 2)

@@ -1,0 +1,191 @@
+"""One camera for all drives of a car: found from several of them together, once they are mapped alone."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from datagen.fleet.engine import Engine, Task
+from datagen.fleet.memory import memory_together
+from datagen.fleet.meter import Meter
+from datagen.fleet.result import CarFound, Labelled
+from datagen.fleet.source import on_this_machine
+from datagen.fleet.storage import Storage
+from datagen.fleet.task import CAMERAS, MAPS, FleetDrive
+from datagen.fleet.work import REFUSED, Outcome, attempted, mark, version
+from datagen.made import key_of
+from datagen.tracks.cameras import DriveCamera, camera_sigma
+from datagen.tracks.car import agreeing_drives, camera_of_car
+from datagen.tracks.visit import read_visit
+from lanenet.data.camera_file import read_camera, write_camera
+from lanenet.errors import MapFormatError, TrackingLostError
+from lanenet.reading import read_json
+
+CAMERA_NAME = "camera.yaml"
+#: A camera is found from so many drives at most, those that know the focal length best. Chosen: more drives
+#: make it hardly better known, and a drive that is new changes nothing unless it is one of the best.
+_MOST_DRIVES = 4
+
+
+@dataclass(frozen=True)
+class CameraJob:
+    """What a worker needs to find the camera of a car.
+
+    Attributes:
+        car: Name of the car.
+        drives: Drives, with the keys of their maps.
+        out: Path or URL of the storage.
+        key: Of the result.
+        made_by: The :func:`datagen.fleet.work.version` of the program that wants it.
+    """
+
+    car: str
+    drives: tuple[tuple[FleetDrive, str], ...]
+    out: str
+    key: str
+    made_by: str
+
+
+def without_camera(drives: Sequence[FleetDrive]) -> dict[str, list[int]]:
+    """Return the drives of each car whose camera is not given, by their places, where there are several."""
+    cars: dict[str, list[int]] = defaultdict(list)
+    for place, drive in enumerate(drives):
+        if drive.car and drive.camera is None and drive.checksum:
+            cars[drive.car].append(place)
+    return {car: places for car, places in cars.items() if len(places) > 1}
+
+
+def find_cameras(
+    cars: dict[str, list[Labelled]], storage: Storage, engine: Engine
+) -> tuple[list[CarFound], str]:
+    """Find the camera of each car, unless that was done before.
+
+    Args:
+        cars: The drives of each car, mapped alone.
+        storage: Where results are kept.
+        engine: What spreads the work.
+
+    Returns:
+        The cars, and which disk was full.
+    """
+    found = [_compared(car, drives, storage) for car, drives in cars.items()]
+    jobs = {}
+    for place, car in enumerate(found):
+        if car.key and storage.result(CAMERAS, car.key) is None:
+            drives = {drive.map_key: drive.drive for drive in cars[car.name]}
+            chosen = tuple((drives[key], key) for key in car.from_maps)
+            jobs[place] = CameraJob(car.name, chosen, storage.url, car.key, version())
+    failed, disk_full = dict[int, str](), ""
+    if jobs:
+        # All drives are in memory together.
+        tasks = [
+            Task(f"camera of {job.car}", job, memory_together(drive.source for drive, _ in job.drives))
+            for job in jobs.values()
+        ]
+        places = list(jobs)
+        with closing(engine.run(find_camera, tasks)) as running:
+            for end in running:
+                outcome = Outcome("", end.error) if end.error else end.result
+                if not outcome.verdict:
+                    failed[places[end.number]] = outcome.reason
+                if outcome.disk_full:
+                    disk_full = outcome.reason
+                    break
+    return [_with_result(car, storage, failed.get(k, "")) for k, car in enumerate(found)], disk_full
+
+
+def find_camera(job: CameraJob) -> Outcome:
+    """Find the camera of a car from its drives; a function of a module, since workers call it."""
+    return attempted(job.made_by, lambda: _find_camera(job))
+
+
+def _find_camera(job: CameraJob) -> Outcome:
+    storage, meter = Storage(job.out), Meter()
+    marker = {"car": job.car, "drives": [drive.name for drive, _ in job.drives]}
+    with ExitStack() as stack:
+        visits = [
+            read_visit(
+                stack.enter_context(storage.fetched(MAPS, key)),
+                stack.enter_context(on_this_machine(drive.source)),
+            )
+            for drive, key in job.drives
+        ]
+        with storage.new(CAMERAS, job.key) as folder:
+            try:
+                found = camera_of_car(visits, np.random.default_rng(visits[0].prepared.settings.seed))
+            except TrackingLostError as error:
+                mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
+                return Outcome(REFUSED, str(error))
+            names = ", ".join(drive.name for drive, _ in job.drives)
+            write_camera(folder / CAMERA_NAME, found.camera, f"from {names} together")
+            facts = {"sigma": found.sigma, "heights_cm": [None if h != h else h for h in found.height_cm]}
+            mark(folder, {**marker, "verdict": "found", "reason": "", **facts}, meter)
+    return Outcome("found")
+
+
+def with_camera(drive: FleetDrive, car: CarFound, storage: Storage) -> FleetDrive:
+    """Return a drive with its car's camera, which says how high it is."""
+    path = f"{storage.url.rstrip('/')}/{CAMERAS}/{car.key}/{CAMERA_NAME}"
+    return replace(drive, camera=path, camera_height_cm=None)
+
+
+def _compared(car: str, drives: Sequence[Labelled], storage: Storage) -> CarFound:
+    """Test whether the drives of a car had one camera, and choose those that show it best."""
+    mapped = {drive.map_key: drive.drive.name for drive in drives if drive.has_labels}
+    cameras, given = _cameras(list(mapped), storage)
+    keys, names = list(cameras), [mapped[key] for key in cameras]
+    agreeing, odd = agreeing_drives(list(cameras.values())) if cameras else ([], [])
+    reasons = {names[one.place]: f"another camera than that of {names[one.than]}: {one.text}" for one in odd}
+    reasons |= {mapped[key]: "has a camera of its own" for key in given}
+    if len(agreeing) < 2:
+        few = f"expected two drives that show it and agree, found {len(agreeing)} of {len(drives)} drives"
+        return CarFound(car, tuple(drive.drive.name for drive in drives), own=reasons, reason=few)
+    chosen = tuple(sorted(keys[k] for k in agreeing[:_MOST_DRIVES]))
+    return CarFound(
+        car,
+        tuple(drive.drive.name for drive in drives),
+        key_of(CAMERAS, chosen),
+        chosen,
+        tuple(mapped[key] for key in chosen),
+        reasons,
+    )
+
+
+def _cameras(keys: Sequence[str], storage: Storage) -> tuple[dict[str, DriveCamera], list[str]]:
+    """Read the cameras of maps that found theirs and closed a loop, without which the lens is a guess.
+
+    Returns:
+        The cameras by the keys of the maps, and the keys of those whose camera was given.
+    """
+    found, given = dict[str, DriveCamera](), list[str]()
+    files = {name: storage.read_all(MAPS, keys, name) for name in (CAMERA_NAME, "report.json")}
+    with tempfile.TemporaryDirectory(prefix="lanenet-") as temporary:
+        folder = Path(temporary)
+        for key in keys:
+            for name, data in files.items():
+                (folder / name).write_bytes(data[key])
+            calibration = read_json(folder / "report.json", MapFormatError).get("calibration")
+            if calibration is None:
+                given.append(key)
+            elif calibration.get("closed"):
+                found[key] = DriveCamera(key, read_camera(folder / CAMERA_NAME), camera_sigma(folder))
+    return found, given
+
+
+def _with_result(car: CarFound, storage: Storage, failed: str) -> CarFound:
+    """Return a car with its camera, or with the reason why there is none."""
+    result = storage.result(CAMERAS, car.key) if car.key and not failed else None
+    if result is None or result["verdict"] == REFUSED:
+        reason = failed or car.reason or ("the run ended before" if result is None else result["reason"])
+        return replace(car, key="", reason=reason)
+    data = storage.read(CAMERAS, car.key, CAMERA_NAME) or b""
+    with tempfile.TemporaryDirectory(prefix="lanenet-") as folder:
+        file = Path(folder) / CAMERA_NAME
+        file.write_bytes(data)
+        return replace(car, camera=read_camera(file), sigma=result["sigma"])

@@ -1,0 +1,259 @@
+"""Drives of one track: named, or recognised by their maps; their maps are joined once all are mapped."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.fleet.engine import Engine, Task
+from datagen.fleet.memory import memory_together
+from datagen.fleet.meter import Meter
+from datagen.fleet.result import Labelled, TrackFound
+from datagen.fleet.source import on_this_machine
+from datagen.fleet.storage import Storage
+from datagen.fleet.task import MAPS, TRACKS, FleetDrive
+from datagen.fleet.work import REFUSED, Outcome, attempted, mark, name_source, shrink_picture, version
+from datagen.made import key_of
+from datagen.tracks.join import join_fitting
+from datagen.tracks.recognise import recognise
+from datagen.tracks.shape import read_shape
+from datagen.tracks.visit import read_visit
+from lanenet.data.files import json_text
+from lanenet.data.maps.joined import read_joined, write_joined
+from lanenet.errors import LanenetError
+
+#: Which maps are of one track, beside the results.
+ALIKE_NAME = "alike.json"
+#: So many maps of a track are joined at most, evenly chosen: all frames are adjusted together. Chosen: ten
+#: minutes of driving or so.
+_MOST_JOINED = 12
+#: What the shapes of two maps take while they are compared, [bytes]. Chosen: ten times the edge points of a
+#: map of 1200 frames.
+_COMPARING = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class AlikeJob:
+    """What a worker needs to compare a map with others: their keys, the storage, and who wants it."""
+
+    key: str
+    others: tuple[str, ...]
+    out: str
+    made_by: str
+
+
+@dataclass(frozen=True)
+class JoinJob:
+    """What a worker needs to join maps.
+
+    Attributes:
+        track: Name of the track.
+        drives: Its drives, with the keys of their maps.
+        out: Path or URL of the storage.
+        key: Of the result.
+        made_by: The :func:`datagen.fleet.work.version` of the program that wants it.
+    """
+
+    track: str
+    drives: tuple[tuple[FleetDrive, str], ...]
+    out: str
+    key: str
+    made_by: str
+
+
+def named_tracks(drives: Sequence[Labelled]) -> dict[str, list[Labelled]]:
+    """Return the mapped drives of each track that has a name."""
+    tracks: dict[str, list[Labelled]] = defaultdict(list)
+    for drive in drives:
+        if drive.drive.track and drive.has_labels:
+            tracks[drive.drive.track].append(drive)
+    return dict(tracks)
+
+
+def recognised_tracks(
+    drives: Sequence[Labelled], storage: Storage, engine: Engine
+) -> dict[str, list[Labelled]]:
+    """Return the mapped drives of each track; those whose track has no name are recognised by their maps.
+
+    Pairs that were compared before are not compared again.
+
+    Args:
+        drives: All drives.
+        storage: Where results are kept.
+        engine: What spreads the work.
+    """
+    mapped = [drive for drive in drives if drive.has_labels]
+    known: dict[str, str] = json.loads(storage.read(ALIKE_NAME) or b"{}")
+    tasks = []
+    for place, drive in enumerate(mapped):
+        before = [one for one in mapped[:place] if not (one.drive.track and drive.drive.track)]
+        others = [one.map_key for one in before if _pair(drive.map_key, one.map_key) not in known]
+        if others:
+            job = AlikeJob(drive.map_key, tuple(others), storage.url, version())
+            tasks.append(Task(f"track of {drive.drive.name}", job, _COMPARING))
+    if tasks:
+        with closing(engine.run(compare_maps, tasks)) as running:
+            for end in running:
+                job = tasks[end.number].input
+                # What could not be compared is not known to be alike, and is compared again in the next run.
+                for other, answer in (end.result or {}).items():
+                    known[_pair(job.key, other)] = answer
+        storage.write(ALIKE_NAME, json_text(dict(sorted(known.items()))).encode())
+    return _grouped(mapped, known)
+
+
+def _pair(one: str, other: str) -> str:
+    return " ".join(sorted((one, other)))
+
+
+def compare_maps(job: AlikeJob) -> dict[str, str]:
+    """Say whether a map is of the track of others, by their keys; a function of a module.
+
+    Raises:
+        LanenetError: If a map cannot be read.
+    """
+    if job.made_by != version():
+        raise LanenetError(f"found {version()}, the run needs {job.made_by}")
+    storage = Storage(job.out)
+
+    def shape(key: str) -> Any:
+        with storage.fetched(MAPS, key) as folder:
+            return read_shape(folder)
+
+    own = shape(job.key)
+    return {other: recognise(own, shape(other)).answer for other in job.others}
+
+
+def _grouped(mapped: Sequence[Labelled], known: Mapping[str, str]) -> dict[str, list[Labelled]]:
+    """Put drives together that are of one track by name or by their maps; a track is called by its first."""
+    groups: list[list[Labelled]] = []
+    for drive in mapped:
+        alike = [
+            group
+            for group in groups
+            if any(
+                (drive.drive.track and one.drive.track == drive.drive.track)
+                or known.get(_pair(drive.map_key, one.map_key)) == "same"
+                for one in group
+            )
+        ]
+        names = {one.drive.track for group in alike for one in group if one.drive.track}
+        if len(names | {drive.drive.track} - {""}) > 1:
+            # A drive that lies on two tracks of different names decides nothing.
+            alike = alike[:1]
+        groups = [group for group in groups if group not in alike]
+        groups.append([*(one for group in alike for one in group), drive])
+    named = {}
+    for group in groups:
+        name = next((one.drive.track for one in group if one.drive.track), f"track of {group[0].drive.name}")
+        named[name] = group
+    return named
+
+
+def join_tracks(
+    tracks: Mapping[str, Sequence[Labelled]], storage: Storage, engine: Engine
+) -> tuple[list[TrackFound], str]:
+    """Join the maps of each track that has several, unless that was done before.
+
+    Args:
+        tracks: The drives of each track.
+        storage: Where results are kept.
+        engine: What spreads the work.
+
+    Returns:
+        The tracks, and which disk was full.
+    """
+    jobs = [_job(name, drives, storage) for name, drives in tracks.items() if len(drives) > 1]
+    missing = [job for job in jobs if storage.result(TRACKS, job.key) is None]
+    failed, disk_full = dict[str, str](), ""
+    if missing:
+        # All drives are in memory together.
+        tasks = [
+            Task(job.track, job, memory_together(drive.source for drive, _ in job.drives)) for job in missing
+        ]
+        with closing(engine.run(join_drives, tasks)) as running:
+            for end in running:
+                outcome = Outcome("", end.error) if end.error else end.result
+                if not outcome.verdict:
+                    failed[missing[end.number].key] = outcome.reason
+                if outcome.disk_full:
+                    disk_full = outcome.reason
+                    break
+    return [_found(job, len(tracks[job.track]), storage, failed.get(job.key, "")) for job in jobs], disk_full
+
+
+def _job(name: str, drives: Sequence[Labelled], storage: Storage) -> JoinJob:
+    """Choose the maps that are joined; their order, and so the frame of the track, is that of the drives."""
+    places = np.unique(np.linspace(0, len(drives) - 1, min(len(drives), _MOST_JOINED)).astype(int))
+    chosen = tuple((drives[k].drive, drives[k].map_key) for k in places)
+    key = key_of(TRACKS, [(drive.name, map_key) for drive, map_key in chosen])
+    return JoinJob(name, chosen, storage.url, key, version())
+
+
+def join_drives(job: JoinJob) -> Outcome:
+    """Join the maps of a track; a function of a module, since workers call it."""
+    return attempted(job.made_by, lambda: _join(job))
+
+
+def _join(job: JoinJob) -> Outcome:
+    storage, meter = Storage(job.out), Meter()
+    marker: dict[str, Any] = {"track": job.track, "drives": [drive.name for drive, _ in job.drives]}
+    with ExitStack() as stack:
+        visits = {
+            drive.name: read_visit(
+                stack.enter_context(storage.fetched(MAPS, key)),
+                stack.enter_context(on_this_machine(drive.source)),
+            )
+            for drive, key in job.drives
+        }
+        with storage.new(TRACKS, job.key) as folder:
+            try:
+                report = join_fitting(visits, folder)
+            except LanenetError as error:
+                mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
+                return Outcome(REFUSED, str(error))
+            _name_places(folder, job)
+            shrink_picture(folder)
+            figures = report.figures
+            facts = {name: figures[name] for name in ("left_out", "lane_cm", "shared_camera", "relaid")}
+            joined = list(figures["drives"])
+            mark(folder, {**marker, "verdict": "joined", "reason": "", "joined": joined, **facts}, meter)
+    return Outcome("joined")
+
+
+def _name_places(folder: Path, job: JoinJob) -> None:
+    """Let joined maps name their drives and maps by the places where they lie for all machines."""
+    keys = {drive.name: key for drive, key in job.drives}
+    for drive, _ in job.drives:
+        if (folder / drive.name).is_dir():
+            name_source(folder / drive.name / "map.yaml", drive.source)
+    meta = read_joined(folder)
+    drives = tuple(
+        one.model_copy(update={"made_from": f"{job.out.rstrip('/')}/{MAPS}/{keys[one.map]}"})
+        for one in meta.drives
+    )
+    write_joined(folder, meta.model_copy(update={"drives": drives}))
+
+
+def _found(job: JoinJob, count: int, storage: Storage, failed: str) -> TrackFound:
+    """Return what became of a track."""
+    found = TrackFound(job.track, count, job.key, tuple(drive.name for drive, _ in job.drives))
+    result = storage.result(TRACKS, job.key) if not failed else None
+    if result is None or result["verdict"] == REFUSED:
+        return replace(
+            found, reason=failed or ("the run ended before" if result is None else result["reason"])
+        )
+    return replace(
+        found,
+        joined=tuple(result["joined"]),
+        left_out=result["left_out"],
+        lane_cm=result["lane_cm"],
+        relaid=tuple(place["text"] for place in result["relaid"]),
+    )
