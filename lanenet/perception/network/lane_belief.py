@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
-
-import numpy as np
-from jaxtyping import Float
 
 from lanenet.perception.rolling_median import RollingMedian
 
@@ -73,14 +71,14 @@ class LineLooks:
         """Probability that the lane is the one to drive in; NaN without a side on which cars drive."""
         return math.nan if self.keep is None else 1.0 / (1.0 + math.exp(-self._log_odds))
 
-    def remember(self, side: int, look: Float[np.ndarray, "3"]) -> None:
+    def remember(self, side: int, look: Sequence[float]) -> None:
         """Add what a frame shows of a line.
 
         Args:
             side: 0 for the left line, 1 for the right one.
             look: See :class:`lanenet.perception.network.refinement.RefinedLines`.
         """
-        line, (yellow, red, gaps) = self._lines[side], look.tolist()
+        line, (yellow, red, gaps) = self._lines[side], look
         line.yellow.append(yellow)
         line.red.append(red)
         line.gaps.append(gaps)
@@ -117,10 +115,10 @@ class LineLooks:
             return math.nan, math.nan
         return self._lines[side].yellow.median, self._lines[side].red.median
 
-    def unlike(self, side: int | None, look: Float[np.ndarray, "3"]) -> float:
+    def unlike(self, side: int | None, look: Sequence[float]) -> float:
         """Return how surely a marking is another one than a line, by its hue: 0 to 1, 0 while unknown."""
-        (yellow, red), shown = self.hues(side), look.tolist()
-        off = math.hypot(yellow - shown[0], red - shown[1]) / _HUE_SIGMA
+        yellow, red = self.hues(side)
+        off = math.hypot(yellow - look[0], red - look[1]) / _HUE_SIGMA
         return 0.0 if math.isnan(off) else 1.0 - math.exp(-0.5 * off * off)
 
     def cross(self, side: int) -> None:

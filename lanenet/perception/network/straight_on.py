@@ -7,6 +7,7 @@ Whoever wants to turn there has to know it from elsewhere: a camera sees the roa
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,10 +43,10 @@ _FARTHEST_CM, _LONGEST = 160.0, 40
 _STEEPEST = 1.0
 
 
-def turns_away_cm(points_cm: Float[np.ndarray, "3"], side: int) -> float:
+def turns_away_cm(points_cm: Sequence[float], side: int) -> float:
     """Return by how much a line turns away from its lane: the second difference of its points, [cm]."""
-    near, middle, far = points_cm.tolist()
-    second = float(far - 2.0 * middle + near)
+    near, middle, far = points_cm
+    second = far - 2.0 * middle + near
     return second if side == 1 else -second
 
 
@@ -58,13 +59,13 @@ class SeenLines(NamedTuple):
         seen_at: Whether it is at each label row.
     """
 
-    points_cm: Float[np.ndarray, "2 3"]
-    seen_cm: Float[np.ndarray, "2"]
-    seen_at: Bool[np.ndarray, "2 3"]
+    points_cm: Sequence[Sequence[float]]
+    seen_cm: Sequence[float]
+    seen_at: Sequence[Sequence[bool]]
 
-    def turn(self, width_cm: float) -> Float[np.ndarray, "2"]:
+    def turn(self, width_cm: float) -> list[float]:
         """By how much each turns away, as a share of the lane's width."""
-        return np.array([turns_away_cm(x, side) for side, x in enumerate(self.points_cm)]) / width_cm
+        return [turns_away_cm(x, side) / width_cm for side, x in enumerate(self.points_cm)]
 
 
 class StraightOn:
@@ -109,7 +110,7 @@ class StraightOn:
             line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
 
     def turns_away(
-        self, points_cm: Float[np.ndarray, "3"], seen_at: Bool[np.ndarray, "3"], side: int, width_cm: float
+        self, points_cm: Sequence[float], seen_at: Sequence[bool], side: int, width_cm: float
     ) -> bool:
         """Return whether a line turns away from its lane more than lanes bend.
 
@@ -143,8 +144,8 @@ class StraightOn:
         self._frames += 1
         if not leaves and self._suspicious == 0 and _is_plain(lines, width_cm):
             # Their direction 15 cm ahead, as far as both are seen.
-            far = _FAR if lines.seen_at[:, _FAR].all() else _MIDDLE
-            left, right = lines.points_cm.tolist()
+            far = _FAR if all(at[_FAR] for at in lines.seen_at) else _MIDDLE
+            left, right = lines.points_cm
             slope = 0.5 * (left[far] - left[0] + (right[far] - right[0])) / ROWS_CM[far]
             ahead_cm = [slope * (row - ROWS_CM[_MIDDLE]) for row in ROWS_CM]
             self._lines_cm = np.array([[x[_MIDDLE] + dx for dx in ahead_cm] for x in (left, right)])
@@ -171,19 +172,22 @@ class StraightOn:
     @staticmethod
     def _are_the_lanes(lines: SeenLines, expected_cm: Float[np.ndarray, "2 3"], width_cm: float) -> bool:
         """Return whether one line is where it is expected, or both together are a lane near there."""
-        x, seen, turn = lines.points_cm, lines.seen_cm >= _SEEN_CM, lines.turn(width_cm)
+        x, seen = np.array(lines.points_cm), np.array(lines.seen_cm) >= _SEEN_CM
+        ahead, turn = np.array(lines.seen_at)[:, _MIDDLE:].all(axis=1), np.array(lines.turn(width_cm))
         off = np.abs(x - expected_cm)[:, :_FAR].max(axis=1) / width_cm
-        if (seen & (off < _SAME) & (turn < _STRAIGHT) & lines.seen_at[:, _MIDDLE:].all(axis=1)).any():
+        if (seen & (off < _SAME) & (turn < _STRAIGHT) & ahead).any():
             return True
         across = float(x[1, _MIDDLE] - x[0, _MIDDLE]) / width_cm
         beside = abs(float(x[:, _MIDDLE].mean() - expected_cm[:, _MIDDLE].mean())) / width_cm
         is_lane = bool(seen.all()) and _NARROW < across < _WIDE and float(turn.max()) < _TURNS[1]
         return is_lane and beside < _BESIDE
 
-    def doubts(self, points_cm: Float[np.ndarray, "6"], width_cm: float | None) -> Bool[np.ndarray, "6"]:
-        """Return which points of a frame seem to be those of a line that leaves the lane."""
+    def doubts(
+        self, points_cm: Float[np.ndarray, "6"], width_cm: float | None
+    ) -> Bool[np.ndarray, "6"] | None:
+        """Return which points of a frame seem to be those of a line that leaves the lane; None for none."""
         if self._lines_cm is None or width_cm is None or self.leaving is None:
-            return np.zeros(len(points_cm), dtype=bool)
+            return None
         return np.abs(points_cm - self._lines_cm.reshape(-1)) > _DOUBTED * width_cm
 
     def lane(self) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
@@ -196,10 +200,8 @@ class StraightOn:
 
 def _is_plain(lines: SeenLines, width_cm: float) -> bool:
     """Return whether both lines of a lane are seen, and are nearly straight."""
-    # Plain numbers: for two lines arrays cost more than they save.
-    if min(lines.seen_cm.tolist()) < _PLAIN_CM:
+    if min(lines.seen_cm) < _PLAIN_CM:
         return False
-    left, right = (x.tolist()[:_FAR] for x in lines.points_cm)
-    off = max(abs((b - a) / width_cm - 1.0) for a, b in zip(left, right, strict=True))
-    turn = max(abs(turns_away_cm(x, side) / width_cm) for side, x in enumerate(lines.points_cm))
-    return off < _PLAIN_WIDTH and turn < _PLAIN_TURN
+    left, right = lines.points_cm
+    off = max(abs((right[row] - left[row]) / width_cm - 1.0) for row in range(_FAR))
+    return off < _PLAIN_WIDTH and max(map(abs, lines.turn(width_cm))) < _PLAIN_TURN

@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from lanenet.geometry.lane import ROWS_CM, SIDES, parallel_points
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, SIDES, parallel_points
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import SURE, LaneMemory
 from lanenet.perception.network import compiled
@@ -31,7 +31,7 @@ _NETWORK_SIGMA = 2.0
 _LEAST_PRESENCE = 0.3
 #: Sigma of what changes at the label rows from one frame to the next. Chosen: a car at 1 m/s and 20 frames/s
 #: moves by 5 cm between two, and turns by 0.1 rad in the tightest bend.
-_MOVED_CM = np.array([2.0, 3.0, 5.0])
+_MOVED_CM = (2.0, 3.0, 5.0)
 #: Width of a marking before any was seen, and its sigma; its sigma once so many were seen; so many count.
 _MARKING_CM, _MARKING_SIGMA_CM, _KNOWN_SIGMA_CM, _ENOUGH, _LENGTH = 3.0, 2.0, 0.3, 10, 50
 #: Once markings are known, they are measured without that knowledge every so many frames. Chosen.
@@ -86,27 +86,46 @@ _RECALLED = 0.15
 _ENDED = 0.62
 #: The other line of a bend is found within this share of the width of where it is expected. Chosen.
 _BESIDE = 0.1
-_NOWHERE, _UNSEEN = np.zeros(3, dtype=bool), np.full(3, np.nan)
-
+_NOWHERE, _UNSEEN = [False] * len(ROWS_CM), [math.nan] * len(ROWS_CM)
+_CERTAIN = np.ones(len(SIDES))
 
 #: Whether most of a line, given by its points at the label rows, frame car, would be in the image.
 Sees = Callable[[Float[np.ndarray, "3"]], bool]
 
 
-class _Candidate(NamedTuple):
-    """One line that may be the answer: its points, their sigmas, its marking, and what speaks for it.
+# Below, lines are plain numbers: for so few of them arrays cost more than their sums.
 
-    The presence is the network's, of the lines that it sees itself.
+
+class _Start(NamedTuple):
+    """Where a line may be: at most that surely, and what speaks for it before the edges were looked at.
+
+    A line is known as the left one, 0, or the right one, 1, if it should look like that; as None it may have
+    any look. The presence is the network's, of the lines that it sees itself.
     """
 
-    points_cm: Float[np.ndarray, "3"]
-    sigma_cm: Float[np.ndarray, "3"]
-    marking_cm: float
+    side: int
+    points_cm: list[float]
+    sigma_cm: list[float]
+    score_cm: float
+    known_as: int | None
+    presence: float = 0.0
+    beyond: bool = False
+
+
+class _Candidate(NamedTuple):
+    """One line that may be the answer: its points, their sigmas, and what speaks for it."""
+
+    points_cm: list[float]
+    sigma_cm: list[float]
     seen_cm: float
     score_cm: float
-    seen_at: Bool[np.ndarray, "3"]
-    look: Float[np.ndarray, "3"]
+    seen_at: list[bool]
+    look: list[float]
     presence: float = 0.0
+
+
+#: Points, or sigmas, of the left and of the right line.
+_Both = list[list[float]]
 
 
 class LaneTracker:
@@ -120,7 +139,7 @@ class LaneTracker:
     def __init__(self, lane: LaneMemory, keep: Keep | None = None, sees: Sees | None = None) -> None:
         self.lane = lane
         self.looks = LineLooks(keep)
-        self._last: tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]] | None = None
+        self._last: tuple[_Both, _Both] | None = None
         self.straight_on = StraightOn()
         self._sees = sees
         self._markings_cm = [RollingMedian(_LENGTH), RollingMedian(_LENGTH)]
@@ -153,35 +172,38 @@ class LaneTracker:
             Points and sigmas, NaN where the place is unknown, and the length along the road in which each
             line was seen, [cm].
         """
-        own = points_cm.reshape(2, 3), _NETWORK_SIGMA * sigma_cm.reshape(2, 3)
+        own = _both(points_cm), _both(_NETWORK_SIGMA * sigma_cm)
+        present = presence.tolist()
         borders = RoadBorders(edges)
-        pair, decided = self._best_pair(self._candidates(own, presence, borders))
-        if self._at_junction(pair, presence, borders):
-            self._last = self.straight_on.lane()
-            return (*self._known(*(a.reshape(6) for a in self._last)), np.zeros(len(SIDES)))
+        pair, decided = self._best_pair(self._candidates(own, present, borders))
+        if self._at_junction(pair, present, borders):
+            continued_cm, continued_sigma_cm = self.straight_on.lane()
+            self._last = continued_cm.tolist(), continued_sigma_cm.tolist()
+            return (*self._known(continued_cm.ravel(), continued_sigma_cm.ravel()), np.zeros(len(SIDES)))
         self._notice_change(pair)
-        self._measure_markings(own, presence, pair, borders)
+        self._measure_markings(own, present, pair, borders)
         for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
                 self.looks.remember(side, line.look)
         self.looks.judge()
-        found_cm = np.concatenate([line.points_cm for line in pair])
-        found_sigma_cm = np.concatenate([_sigma_cm(line) for line in pair])
-        seen_cm = np.array([line.seen_cm for line in pair])
+        left, right = pair
+        found_cm = np.array(left.points_cm + right.points_cm)
+        found_sigma_cm = np.array(_sigma_cm(left) + _sigma_cm(right))
         self._recall_near(pair, found_cm, found_sigma_cm)
         # One line that is seen tells where the other one is.
-        told = np.where(seen_cm >= _LINE_SEEN_CM, 1.0, 0.0)
+        told = np.array([1.0 if line.seen_cm >= _LINE_SEEN_CM else 0.0 for line in pair])
         found_cm, found_sigma_cm = self.lane.complete(found_cm, found_sigma_cm, told)
-        self._last = found_cm.reshape(2, 3), found_sigma_cm.reshape(2, 3).copy()
-        found_sigma_cm[self.straight_on.doubts(found_cm, self.lane.width_cm)] = np.inf
+        self._last = _both(found_cm), _both(found_sigma_cm)
+        if (doubts := self.straight_on.doubts(found_cm, self.lane.width_cm)) is not None:
+            found_sigma_cm[doubts] = np.inf
         for side, line in enumerate(pair):
             # A solid line that is not seen ahead turns away there, or ends.
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
                 found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = np.inf
-        if not decided or self._astride(seen_cm):
+        if not decided or self._astride(pair):
             found_sigma_cm[:] = np.inf
-        apart_cm = np.repeat(np.abs(self._last[0] - own[0])[:, _MIDDLE], len(ROWS_CM))
-        return (*self._known(found_cm, found_sigma_cm, apart_cm), seen_cm)
+        known = self._known(found_cm, found_sigma_cm, points_cm)
+        return (*known, np.array([left.seen_cm, right.seen_cm]))
 
     def _recall_near(
         self,
@@ -192,89 +214,93 @@ class LaneTracker:
         """Where a line passes out of view beside the car, fuse its place there with the last frame's."""
         if self._last is None:
             return
-        for side, line in enumerate(pair):
-            beside, ahead = len(ROWS_CM) * side, len(ROWS_CM) * side + _MIDDLE
-            off_cm = abs(self._last[0][side, _MIDDLE] - found_cm[ahead])
+        for side, (line, last_cm, last_sigma_cm) in enumerate(zip(pair, *self._last, strict=True)):
+            off_cm = abs(last_cm[_MIDDLE] - line.points_cm[_MIDDLE])
             if line.seen_cm < _LINE_SEEN_CM or line.seen_at[0] or off_cm > _RECALLED * self.lane.likely_cm:
                 continue
-            found, recalled = found_sigma_cm[beside] ** 2, self._last[1][side, 0] ** 2 + _MOVED_CM[0] ** 2
+            beside = len(ROWS_CM) * side
+            found, recalled = float(found_sigma_cm[beside]) ** 2, _moved(last_sigma_cm)[0] ** 2
             gain = found / (found + recalled)
-            found_cm[beside] += gain * (self._last[0][side, 0] - found_cm[beside])
+            found_cm[beside] += gain * (last_cm[0] - found_cm[beside])
             found_sigma_cm[beside] = math.sqrt(gain * recalled)
 
     def _known(
         self,
         points_cm: Float[np.ndarray, "6"],
         sigma_cm: Float[np.ndarray, "6"],
-        apart_cm: Float[np.ndarray, "6"] | float = 0.0,
+        own_cm: Float[np.ndarray, "6"] | None = None,
     ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
-        """Return points and sigmas, NaN where the place is unknown; ``apart_cm`` is from the network's."""
-        unknown = np.hypot(sigma_cm, apart_cm) > _MOST_LANES * self.lane.likely_cm
-        return np.where(unknown, np.nan, points_cm), np.where(unknown, np.nan, sigma_cm)
+        """Return points and sigmas, NaN where the place is unknown; ``own_cm`` is the network's answer."""
+        most_cm, points, sigmas = _MOST_LANES * self.lane.likely_cm, points_cm.tolist(), sigma_cm.tolist()
+        for side in range(0, N_POINTS, len(ROWS_CM)):
+            middle = side + _MIDDLE
+            apart_cm = 0.0 if own_cm is None else points[middle] - float(own_cm[middle])
+            for i in range(side, side + len(ROWS_CM)):
+                if math.hypot(sigmas[i], apart_cm) > most_cm:
+                    points[i] = sigmas[i] = math.nan
+        return np.array(points), np.array(sigmas)
 
     def _candidates(
-        self,
-        own: tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]],
-        presence: Float[np.ndarray, "2"],
-        borders: RoadBorders,
+        self, own: tuple[_Both, _Both], presence: list[float], borders: RoadBorders
     ) -> tuple[list[_Candidate], list[_Candidate]]:
         """Collect what the left and the right line may be; the last of each is the network's, as it is."""
-        starts: list[tuple[int, np.ndarray, np.ndarray, float]] = []
-        by_network: list[bool] = []
-        moved_cm = None if self._last is None else np.hypot(self._last[1], _MOVED_CM)
-        for side in range(len(SIDES)):
-            if presence[side] >= _LEAST_PRESENCE:
-                starts.append((side, own[0][side], own[1][side], _BY_PRESENCE_CM * float(presence[side])))
-                by_network.append(True)
-            if self._last is not None and moved_cm is not None:
-                starts.append((side, self._last[0][side], moved_cm[side], _BY_CONTINUING_CM))
-                by_network.append(False)
-        n_usual = len(starts)
-        starts += self._beyond_a_crossed_line()
-        by_network += [False] * (len(starts) - n_usual)
-        # The next lane's lines need not look like those of this one.
-        crossed = self._last is not None and (self._last[0][0, 0] > 0.0 or self._last[0][1, 0] < 0.0)
+        starts = self._starts(own, presence)
         candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
         if starts:
-            sides, points, sigmas, scores = zip(*starts, strict=True)
-            # Beyond a crossed line, that is the lane's other one, and other lines may look like any.
-            known_as = [None if crossed else side for side in sides[:n_usual]]
-            known_as += [1 - side if k % 2 == 0 else None for k, side in enumerate(sides[n_usual:])]
-            refined = self._refine(np.array(points), np.array(sigmas), sides, known_as, borders)
-            for i, (side, score_cm) in enumerate(zip(sides, scores, strict=True)):
-                seen_cm = float(refined.seen_cm[i])
-                score_cm = seen_cm + score_cm if seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
-                if i >= n_usual and seen_cm < _BEYOND_SEEN_CM:
+            sides, points, sigmas, _, known_as, _, _ = zip(*starts, strict=True)
+            refined = self._refine(points, sigmas, sides, known_as, borders)
+            fields = refined.points_cm, refined.sigma_cm, refined.seen_cm, refined.seen_at, refined.look
+            for start, points_cm, sigma_cm, seen_cm, seen_at, look in zip(
+                starts, *(field.tolist() for field in fields), strict=True
+            ):
+                if start.beyond and seen_cm < _BEYOND_SEEN_CM:
                     continue
-                score_cm -= _BY_LOOK_CM * self.looks.unlike(known_as[i], refined.look[i])
-                line = refined.points_cm[i], refined.sigma_cm[i], float(refined.marking_cm[i])
-                present = float(presence[side]) if by_network[i] else 0.0
-                candidates[side].append(
-                    _Candidate(*line, seen_cm, score_cm, refined.seen_at[i], refined.look[i], present)
-                )
+                score_cm = start.score_cm
+                score_cm = seen_cm + score_cm if seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
+                score_cm -= _BY_LOOK_CM * self.looks.unlike(start.known_as, look)
+                line = points_cm, sigma_cm, seen_cm, score_cm, seen_at, look, start.presence
+                candidates[start.side].append(_Candidate(*line))
         for side, lines in enumerate(candidates):
-            doubt_cm = _BY_PRESENCE_CM * (float(presence[side]) - 0.5)
-            lines.append(_Candidate(own[0][side], own[1][side], 0.0, 0.0, doubt_cm, _NOWHERE, _UNSEEN))
+            doubt_cm = _BY_PRESENCE_CM * (presence[side] - 0.5)
+            lines.append(_Candidate(own[0][side], own[1][side], 0.0, doubt_cm, _NOWHERE, _UNSEEN))
         return candidates
+
+    def _starts(self, own: tuple[_Both, _Both], presence: list[float]) -> list[_Start]:
+        """Return where lines are looked for: by the network, by the last frame, and beyond a crossed line."""
+        last, starts = self._last, []
+        # The next lane's lines need not look like those of this one.
+        crossed = last is not None and (last[0][0][0] > 0.0 or last[0][1][0] < 0.0)
+        for side, present in enumerate(presence):
+            known_as = None if crossed else side
+            if present >= _LEAST_PRESENCE:
+                score_cm = _BY_PRESENCE_CM * present
+                starts.append(_Start(side, own[0][side], own[1][side], score_cm, known_as, present))
+            if last is not None:
+                moved_cm = _moved(last[1][side])
+                starts.append(_Start(side, last[0][side], moved_cm, _BY_CONTINUING_CM, known_as))
+        if crossed:
+            starts += self._beyond_a_crossed_line()
+        return starts
 
     def _on_line(self) -> bool:
         """Return whether the front axle's middle was on one of the lane's lines."""
         if self._last is None:
             return False
-        beside_cm = min(abs(float(self._last[0][side, 0])) for side in range(len(SIDES)))
+        beside_cm = min(abs(line_cm[0]) for line_cm in self._last[0])
         return beside_cm < _ON_LINE * self.lane.likely_cm
 
-    def _astride(self, seen_cm: Float[np.ndarray, "2"]) -> bool:
+    def _astride(self, pair: tuple[_Candidate, _Candidate]) -> bool:
         """Return whether the front axle's middle is on a line that alone is seen: its side is a guess."""
         assert self._last is not None
-        x_cm, sigma_cm = (a[:, 0].tolist() for a in self._last)
-        nearest = 0 if abs(x_cm[0]) < abs(x_cm[1]) else 1
-        reach_cm = _ASTRIDE * self.lane.likely_cm + sigma_cm[nearest]
-        return bool(abs(x_cm[nearest]) < reach_cm and seen_cm[1 - nearest] < _LINE_SEEN_CM)
+        (left_cm, right_cm), sigma_cm = self._last
+        nearest = 0 if abs(left_cm[0]) < abs(right_cm[0]) else 1
+        reach_cm = _ASTRIDE * self.lane.likely_cm + sigma_cm[nearest][0]
+        beside_cm = abs((left_cm, right_cm)[nearest][0])
+        return beside_cm < reach_cm and pair[1 - nearest].seen_cm < _LINE_SEEN_CM
 
-    def _beyond_a_crossed_line(self) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
+    def _beyond_a_crossed_line(self) -> list[_Start]:
         """Return where the lines of the next lane are expected, once the front axle has crossed one."""
-        starts: list[tuple[int, np.ndarray, np.ndarray, float]] = []
+        starts: list[_Start] = []
         width_cm = self.lane.width_cm
         if self._last is None or width_cm is None:
             return starts
@@ -282,27 +308,31 @@ class LaneTracker:
             crossed_cm = self._last[0][side]
             if outwards * crossed_cm[0] >= 0.0:
                 continue
-            sigma_cm = np.hypot(self._last[1][side], _MOVED_CM)
-            next_cm = parallel_points(crossed_cm, outwards * width_cm)
-            if np.isfinite(next_cm).all():
-                starts.append((1 - side, crossed_cm, sigma_cm, _BY_CONTINUING_CM))
-                starts.append((side, next_cm, np.hypot(sigma_cm, _MOVED_CM), _BY_CONTINUING_CM))
+            sigma_cm = _moved(self._last[1][side])
+            next_cm = parallel_points(np.array(crossed_cm), outwards * width_cm).tolist()
+            if all(map(math.isfinite, next_cm)):
+                # That is the next lane's other line, and lines beyond it may look like any.
+                crossed = 1 - side, crossed_cm, sigma_cm, _BY_CONTINUING_CM, side
+                starts.append(_Start(*crossed, beyond=True))
+                beyond = side, next_cm, _moved(sigma_cm), _BY_CONTINUING_CM, None
+                starts.append(_Start(*beyond, beyond=True))
         return starts
 
     def _at_junction(
-        self, pair: tuple[_Candidate, _Candidate], presence: Float[np.ndarray, "2"], borders: RoadBorders
+        self, pair: tuple[_Candidate, _Candidate], presence: list[float], borders: RoadBorders
     ) -> bool:
         """Return whether the lines that the frame shows are not those of the lane, which goes straight on."""
         width_cm = self.lane.width_cm
         if self._last is None or width_cm is None:
             return False
-        points_cm, seen_cm, seen_at = (np.array([line[i] for line in pair]) for i in (0, 3, 5))
-        lines = SeenLines(points_cm, seen_cm, seen_at)
+        left, right = pair
+        points_cm = left.points_cm, right.points_cm
+        lines = SeenLines(points_cm, (left.seen_cm, right.seen_cm), (left.seen_at, right.seen_at))
         bends, leaving, ended = self._turning(pair, presence, width_cm, borders)
         if self.straight_on.on:
             assert self.straight_on.leaving is not None
             other = 1 - self.straight_on.leaving
-            goes_on = bool(presence[other] > SURE and seen_cm[other] >= _WIDTH_SEEN_CM)
+            goes_on = presence[other] > SURE and pair[other].seen_cm >= _WIDTH_SEEN_CM
             self.straight_on.look_for_its_end(lines, bends or goes_on, width_cm)
         else:
             self.straight_on.look(lines, leaving, ended, width_cm)
@@ -311,7 +341,7 @@ class LaneTracker:
     def _turning(
         self,
         pair: tuple[_Candidate, _Candidate],
-        presence: Float[np.ndarray, "2"],
+        presence: list[float],
         width_cm: float,
         borders: RoadBorders,
     ) -> tuple[bool, int | None, bool]:
@@ -320,16 +350,16 @@ class LaneTracker:
             turns = self.straight_on.turns_away(line.points_cm, line.seen_at, side, width_cm)
             if line.seen_cm < _LINE_SEEN_CM or not turns or self.looks.is_between_lanes(side):
                 continue
-            beside_cm = parallel_points(line.points_cm, width_cm if side == 0 else -width_cm)
+            beside_cm = parallel_points(np.array(line.points_cm), width_cm if side == 0 else -width_cm)
             if not np.isfinite(beside_cm).all() or self._sees is None or not self._sees(beside_cm):
                 continue
-            sigma_cm = np.hypot(line.sigma_cm, _MOVED_CM)
-            found = self._refine(beside_cm[None], sigma_cm[None], [1 - side], [None], borders)
+            sigma_cm = _moved(line.sigma_cm)
+            found = self._refine([beside_cm.tolist()], [sigma_cm], [1 - side], [None], borders)
             off_cm = np.abs(found.points_cm[0] - beside_cm).max()
             if found.seen_at[0, -1] and found.seen_cm[0] >= _WIDTH_SEEN_CM and off_cm < _BESIDE * width_cm:
                 return True, None, False
             if not other.seen_at[-1] or other.seen_cm < _LINE_SEEN_CM:
-                return False, side, bool(presence[1 - side] < _ENDED)
+                return False, side, presence[1 - side] < _ENDED
         return False, None, False
 
     def _notice_change(self, pair: tuple[_Candidate, _Candidate]) -> None:
@@ -337,13 +367,10 @@ class LaneTracker:
         width_cm = self.lane.width_cm
         if self._last is None or width_cm is None:
             return
-        before_cm = self._last[0][:, _MIDDLE].tolist()
+        before_cm = [line_cm[_MIDDLE] for line_cm in self._last[0]]
         for side in range(len(SIDES)):
-            now_cm, was_cm, crossed_cm = (
-                float(pair[1 - side].points_cm[_MIDDLE]),
-                before_cm[1 - side],
-                before_cm[side],
-            )
+            now_cm = pair[1 - side].points_cm[_MIDDLE]
+            was_cm, crossed_cm = before_cm[1 - side], before_cm[side]
             if abs(now_cm - was_cm) > _CHANGED * width_cm and abs(now_cm - crossed_cm) < _SAME * width_cm:
                 self.looks.cross(side)
                 self._markings_cm[1 - side] = self._markings_cm[side]
@@ -352,8 +379,8 @@ class LaneTracker:
 
     def _measure_markings(
         self,
-        own: tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]],
-        presence: Float[np.ndarray, "2"],
+        own: tuple[_Both, _Both],
+        presence: list[float],
         pair: tuple[_Candidate, _Candidate],
         borders: RoadBorders,
     ) -> None:
@@ -368,7 +395,8 @@ class LaneTracker:
         sides = [side for side in range(len(SIDES)) if presence[side] >= _LEAST_PRESENCE]
         if not sides:
             return
-        found = self._refine(own[0][sides], own[1][sides], sides, [None] * len(sides), borders, known=False)
+        points, sigmas = ([lines[side] for side in sides] for lines in own)
+        found = self._refine(points, sigmas, sides, [None] * len(sides), borders, known=False)
         for i, side in enumerate(sides):
             off_cm = np.abs(found.points_cm[i] - pair[side].points_cm).max()
             if found.seen_cm[i] >= _WIDTH_SEEN_CM and off_cm < _SAME * self.lane.likely_cm:
@@ -376,8 +404,8 @@ class LaneTracker:
 
     def _refine(
         self,
-        points_cm: Float[np.ndarray, "m 3"],
-        sigma_cm: Float[np.ndarray, "m 3"],
+        points_cm: Sequence[list[float]],
+        sigma_cm: Sequence[list[float]],
         sides: Sequence[int],
         known_as: Sequence[int | None],
         borders: RoadBorders,
@@ -392,10 +420,11 @@ class LaneTracker:
         marking = np.array([usual[side] for side in sides])
         sigma = np.array([_KNOWN_SIGMA_CM if counts[side] else _MARKING_SIGMA_CM for side in sides])
         hues = np.array([self.looks.hues(side) for side in known_as])
-        light = refine_lines(points_cm, sigma_cm, borders, marking, sigma, hues)
+        lines = np.array(points_cm), np.array(sigma_cm), borders
+        light = refine_lines(*lines, marking, sigma, hues)
         if all(counts[side] for side in sides):
             return light
-        dark = refine_lines(points_cm, sigma_cm, borders, -marking, sigma, hues)
+        dark = refine_lines(*lines, -marking, sigma, hues)
         darker = (dark.seen_cm > light.seen_cm) & ~np.array([counts[side] for side in sides])
         return RefinedLines(
             *(
@@ -412,16 +441,15 @@ class LaneTracker:
         Returns:
             The pair, and whether clearly less speaks for each pair in the next lane.
         """
-        lefts_cm, rights_cm = (np.array([line.points_cm for line in lines]) for lines in candidates)
-        across_cm, least_cm = distances_cm(lefts_cm, rights_cm).tolist(), _NARROWEST * self.lane.likely_cm
-        left_edges, right_edges = lefts_cm[:, 0].tolist(), (-rights_cm[:, 0]).tolist()
-        # Plain numbers: for so few pairs arrays cost more than they save.
+        lefts_cm, rights_cm = ([line.points_cm for line in lines] for lines in candidates)
+        across_cm = distances_cm(np.array(lefts_cm), np.array(rights_cm)).tolist()
+        least_cm = _NARROWEST * self.lane.likely_cm
         pairs, scores, outsides, widths = [], [], [], []
-        for left, left_cm, row in zip(candidates[0], left_edges, across_cm, strict=True):
-            for right, right_cm, width_cm in zip(candidates[1], right_edges, row, strict=True):
+        for left, row in zip(candidates[0], across_cm, strict=True):
+            for right, width_cm in zip(candidates[1], row, strict=True):
                 if width_cm < least_cm:
                     continue
-                outside_cm = max(left_cm, right_cm)
+                outside_cm = max(left.points_cm[0], -right.points_cm[0])
                 apart_cm = _BY_OUTSIDE_CM * min(max(outside_cm / _OUTSIDE_CM, 0.0), 1.0)
                 pairs.append((left, right))
                 scores.append(left.score_cm + right.score_cm - apart_cm)
@@ -434,27 +462,35 @@ class LaneTracker:
         shown = pairs[best]
         # A belief must not choose its own evidence: else a wrong one would never be unlearned.
         if outsides[best] <= 0.0 and min(line.seen_cm for line in shown) >= _TELLS_WIDTH_CM:
-            self.lane.learn(np.concatenate([line.points_cm for line in shown]), np.ones(len(SIDES)))
+            self.lane.learn(np.array(shown[0].points_cm + shown[1].points_cm), _CERTAIN)
         scores = [score - _BY_WIDTH_CM * (1.0 - own) for score, own in zip(scores, likely, strict=True)]
         if self._on_line():
             both = [min(left.presence, right.presence) for left, right in pairs]
             scores = [s + _BY_BOTH_CM * p * own for s, p, own in zip(scores, both, likely, strict=True)]
         chosen = scores.index(max(scores))
-        middles_cm = [
-            float(left.points_cm[_MIDDLE] + right.points_cm[_MIDDLE]) / 2.0 for left, right in pairs
-        ]
+        middles_cm = [0.5 * (left.points_cm[_MIDDLE] + right.points_cm[_MIDDLE]) for left, right in pairs]
         next_cm = _NEXT_LANE * self.lane.likely_cm
         rivals = [s for s, x in zip(scores, middles_cm, strict=True) if abs(x - middles_cm[chosen]) > next_cm]
         return pairs[chosen], max(rivals, default=-math.inf) < scores[chosen] - _UNDECIDED_CM
 
 
-def _sigma_cm(line: _Candidate) -> Float[np.ndarray, "3"]:
+def _both(values: Float[np.ndarray, "6"]) -> _Both:
+    left_and_right = values.tolist()
+    return [left_and_right[: len(ROWS_CM)], left_and_right[len(ROWS_CM) :]]
+
+
+def _moved(sigma_cm: list[float]) -> list[float]:
+    """Return the sigmas of a line one frame later."""
+    return list(map(math.hypot, sigma_cm, _MOVED_CM))
+
+
+def _sigma_cm(line: _Candidate) -> list[float]:
     """Return the sigmas of a line that is seen here and there, or not as far as the label rows."""
-    sigma_cm = line.sigma_cm.copy()
+    sigma_cm = line.sigma_cm
     if 0.0 < line.seen_cm < _LINE_SEEN_CM:
-        sigma_cm = np.hypot(sigma_cm, _BARELY_CM)
+        sigma_cm = [math.hypot(each_cm, _BARELY_CM) for each_cm in sigma_cm]
     if line.seen_cm > 0.0 and not line.seen_at[-1]:
-        sigma_cm[-1] *= _AHEAD
+        sigma_cm = [*sigma_cm[:-1], _AHEAD * sigma_cm[-1]]
     return sigma_cm
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 
 from lanenet.perception.network.lane_belief import LineLooks
 
-YELLOW_DASHES, WHITE = np.array([0.8, 0.2, 0.2]), np.array([0.0, 0.0, 0.02])
-WHITE_DASHES = np.array([0.0, 0.0, 0.25])
+YELLOW_DASHES, WHITE = [0.8, 0.2, 0.2], [0.0, 0.0, 0.02]
+WHITE_DASHES = [0.0, 0.0, 0.25]
 
 
 def seen(keep, left, right, frames=40):

@@ -17,8 +17,7 @@ SIDE_ROAD = np.array([[-20.0, -18.0, -14.0], [20.0, 24.0, 42.0]])
 
 
 def seen(points_cm: np.ndarray, left: bool = True) -> SeenLines:
-    at = np.array([[left] * 3, [True] * 3])
-    return SeenLines(points_cm, np.array([30.0 * left, 30.0]), at)
+    return SeenLines(points_cm.tolist(), [30.0 * left, 30.0], [[left] * 3, [True] * 3])
 
 
 def at_a_junction(told: bool = True) -> StraightOn:
@@ -89,7 +88,7 @@ def test_a_lane_that_the_car_turned_away_from_is_forgotten(motion):
             lane.moved(*motion, WHEELBASE_CM)
             assert not lane.on or np.abs(lane.lane()[0]).max() < 200.0
     assert not lane.on
-    assert not lane.doubts(SIDE_ROAD.reshape(6), WIDTH_CM).any()
+    assert lane.doubts(SIDE_ROAD.reshape(6), WIDTH_CM) is None
 
 
 def test_its_place_is_less_sure_after_reversing():
@@ -123,9 +122,8 @@ def test_it_ends_after_two_metres():
 
 
 def test_away_is_outwards_on_both_sides():
-    line_cm = np.array([0.0, 1.0, 5.0])
-    assert turns_away_cm(line_cm, 1) == pytest.approx(3.0)
-    assert turns_away_cm(-line_cm, 0) == pytest.approx(3.0)
+    assert turns_away_cm([0.0, 1.0, 5.0], 1) == pytest.approx(3.0)
+    assert turns_away_cm([0.0, -1.0, -5.0], 0) == pytest.approx(3.0)
 
 
 def borders_of(lines_cm: dict[int, np.ndarray]) -> RoadEdges:
