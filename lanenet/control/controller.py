@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
-from lanenet.control.plausibility import JumpCheck, fault_of
+from lanenet.control.plausibility import JumpCheck, fault_of, misfit_of
 from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
 from lanenet.control.steering import SteeringSettings, steering_target_rad
 from lanenet.geometry.lane import parabola_through
@@ -181,7 +181,7 @@ class LaneController:
             self._memory.learn(estimate.points_cm, estimate.presence)
         fault = (
             impossible
-            or fault_of(estimate, width_cm)
+            or (width_cm is not None and misfit_of(estimate, width_cm))
             or self._jumps.fault_of(estimate, t_s, fastest_cm_s, width_cm)
         )
         if fault:

@@ -64,12 +64,20 @@ def fault_of(estimate: LaneEstimate, width_cm: float | None) -> str:
         return f"sigma {known}"
     if any(right <= left for left, right in zip(points[:3], points[3:], strict=True)):
         return "lines that cross"
-    if width_cm is None:
-        return ""
+    return "" if width_cm is None else misfit_of(estimate, width_cm)
+
+
+def misfit_of(estimate: LaneEstimate, width_cm: float) -> str:
+    """Return by what an answer that is possible in itself is not the car's lane; empty if nothing speaks so.
+
+    Args:
+        estimate: The lane of one frame.
+        width_cm: The lane's width.
+    """
     seen_cm = lane_width_cm(estimate.points_cm)
     if not math.isnan(seen_cm) and not _NARROWEST * width_cm <= seen_cm <= _WIDEST * width_cm:
         return f"a lane {seen_cm:.0f} cm wide, expected {width_cm:.0f} cm"
-    left, right = points[_AT :: len(ROWS_CM)]
+    left, right = estimate.points_cm.tolist()[_AT :: len(ROWS_CM)]
     centre_cm = 0.5 * (_or(left, right - width_cm) + _or(right, left + width_cm))
     if abs(centre_cm) > _BESIDE_LANES * width_cm:
         return f"a lane {abs(centre_cm):.0f} cm beside the car"

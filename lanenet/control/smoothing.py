@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
@@ -92,7 +91,17 @@ class LaneSmoother:
                     points[i], variances[i] = x_cm, measured
                 self._unseen_s[i] = 0.0
             sigmas_cm[i] = math.sqrt(variances[i]) if math.isfinite(points[i]) else math.nan
-        return replace(estimate, points_cm=np.array(points), sigma_cm=np.array(sigmas_cm))
+        # Not by dataclasses.replace(), which takes thrice the time.
+        return LaneEstimate(
+            points_cm=np.array(points),
+            sigma_cm=np.array(sigmas_cm),
+            steering_rad=estimate.steering_rad,
+            confidence=estimate.confidence,
+            radius_cm=estimate.radius_cm,
+            offset_cm=estimate.offset_cm,
+            presence=estimate.presence,
+            own_lane=estimate.own_lane,
+        )
 
     def _predict(self, dt_s: float, travel_cm: float, steering_rad: float) -> None:
         growth = dt_s * self._settings.drift_cm_per_sqrt_s**2

@@ -42,11 +42,10 @@ def refine(
     Returns:
         Of each line the points, their sigmas, the width, the length seen, where it is seen, and its look.
     """
-    given = (np.ascontiguousarray(x, np.float64) for x in lines)
+    given = [np.ascontiguousarray(x, np.float64) for x in lines]
     looks = edges.points_cm, edges.normals, edges.hues
-    points_cm, normals, hues = (None if x is None else np.ascontiguousarray(x) for x in looks)
-    single = edges.points_cm.dtype == np.float32
-    found = _kernels.refine(*given, points_cm, normals, hues, numbers, single)
+    seen = [None if x is None else np.ascontiguousarray(x) for x in looks]
+    found = _kernels.refine(*given, *seen, numbers, edges.points_cm.dtype == np.float32)
     return np.frombuffer(found).reshape(-1, _PER_LINE)
 
 

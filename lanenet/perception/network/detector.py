@@ -129,7 +129,9 @@ class NetworkDetector:
         if self._tracker.straight_on.on:
             presence = confirmed = np.full_like(presence, _CONTINUED)
         else:
-            confirmed = np.where(seen_cm >= _SEEN_CM, np.maximum(presence, SURE), 0.5 * presence)
+            # Plain numbers: for two of them arrays cost more than they save.
+            both = zip(presence.tolist(), seen_cm.tolist(), strict=True)
+            confirmed = np.array([max(p, SURE) if seen >= _SEEN_CM else 0.5 * p for p, seen in both])
         return self._estimate(points_cm, sigma_cm, presence, confirmed)
 
     def __call__(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
