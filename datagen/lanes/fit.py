@@ -274,7 +274,7 @@ def parallel_offset(path: Path, d_cm: Samples, apart_cm: Samples) -> Samples:
     return np.where(np.isfinite(outer), sign * outer, found)
 
 
-def _outermost(path: Path, s_cm: Samples, offset_cm: Samples) -> Samples:
+def _outermost(path: Path, s_cm: Float[np.ndarray, "k"], offset_cm: Float[np.ndarray, "k"]) -> Samples:
     """Largest offset at each path sample of a line that may run back; NaN where it does not pass."""
     m, step = len(path.xy_cm), path.step_cm
     outer = np.full(m, -np.inf)

@@ -100,3 +100,16 @@ def test_inside_a_corner_the_parallel_does_not_run_back():
     inner = away < 0.5 * at
     np.testing.assert_allclose(found[inner], (corner + 50.0 * np.sqrt(2.0))[inner], atol=2.5)
     assert (np.abs(np.diff(found))[inner[1:]] < 1.2 * path.step_cm).all()
+
+
+def test_the_same_on_a_closed_path():
+    """A ring with a corner of its line: the parallel inside passes every place once, and is smooth elsewhere."""
+    path = ring_path(200.0)
+    at, period = path.s_cm[len(path.s_cm) // 2], path.period_cm
+    away = np.abs(np.mod(path.s_cm - at + 0.5 * period, period) - 0.5 * period)
+    corner = np.maximum(40.0 - away, 0.0)
+    found = parallel_offset(path, corner, np.full(len(path.s_cm), -APART_CM))
+    assert found.shape == path.s_cm.shape
+    assert np.isfinite(found).all()
+    far = away > 150.0
+    np.testing.assert_allclose(found[far], -APART_CM, atol=0.5)
