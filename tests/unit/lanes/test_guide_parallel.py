@@ -103,7 +103,7 @@ def test_inside_a_corner_the_parallel_does_not_run_back():
 
 
 def test_the_same_on_a_closed_path():
-    """A ring with a corner of its line: the parallel inside passes every place once, and is smooth elsewhere."""
+    """A ring whose line has a corner: the parallel inside passes every place once."""
     path = ring_path(200.0)
     at, period = path.s_cm[len(path.s_cm) // 2], path.period_cm
     away = np.abs(np.mod(path.s_cm - at + 0.5 * period, period) - 0.5 * period)
