@@ -61,8 +61,8 @@ train: $(VENV)/.stamp-train
 LIBRARY ?=
 LABELLED ?=
 general: $(VENV)/.stamp-train
-	$(BIN)/lanenet train configs/general.yaml $(if $(LIBRARY),name=general-real data.library.file=$(LIBRARY)) \
-	  $(if $(LABELLED),data.library.labelled=$(LABELLED)) $(GENERAL)
+	$(BIN)/lanenet train configs/general.yaml $(if $(LIBRARY),name=general-real data.library.file=$(LIBRARY) \
+	  $(if $(LABELLED),data.library.labelled=$(LABELLED))) $(GENERAL)
 
 install: $(VENV)/.stamp-train
 

@@ -181,8 +181,9 @@ def _source(job: RecordedJob, library: Path | None) -> _Source:
     if path is None or path.exists() or library is None:
         return _Source(job, path)
     known = Library.open(library)
-    entries = known.entries()
-    entry = next((entry for entry in entries if entry.name == job.recording.name), None) or known.find(path)
+    # A name is chosen freely, and may be that of another drive: the place decides where it is known.
+    named = (entry for entry in known.entries() if entry.name == job.recording.name)
+    entry = known.find(path) or next(named, None)
     return _Source(job, path, None if entry is None else known.recording(entry.name).fingerprint)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,10 +19,10 @@ from datagen.fleet.result import CarFound, Labelled
 from datagen.fleet.source import on_this_machine
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import CAMERAS, MAPS, FleetDrive
-from datagen.fleet.work import REFUSED, Outcome, attempted, mark, version
+from datagen.fleet.work import REFUSED, REJECTED, Outcome, attempted, mark, version
 from datagen.made import key_of
-from datagen.tracks.cameras import DriveCamera, camera_sigma
-from datagen.tracks.car import agreeing_drives, camera_of_car
+from datagen.tracks.cameras import DriveCamera, camera_sigma, difference
+from datagen.tracks.car import agreeing_drives, camera_of_car, may_be_one
 from datagen.tracks.visit import read_visit
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.errors import MapFormatError, TrackingLostError
@@ -138,11 +139,20 @@ def with_camera(drive: FleetDrive, car: CarFound, storage: Storage) -> FleetDriv
 def _compared(car: str, drives: Sequence[Labelled], storage: Storage) -> CarFound:
     """Test whether the drives of a car had one camera, and choose those that show it best."""
     mapped = {drive.map_key: drive.drive.name for drive in drives if drive.has_labels}
-    cameras, given = _cameras(list(mapped), storage)
+    rejected = {drive.map_key: drive.drive.name for drive in drives if drive.verdict == REJECTED}
+    of_maps = _cameras([*mapped, *rejected], storage)
+    cameras = {key: camera for key, camera in of_maps.closed.items() if key in mapped}
     keys, names = list(cameras), [mapped[key] for key in cameras]
     agreeing, odd = agreeing_drives(list(cameras.values())) if cameras else ([], [])
     reasons = {names[one.place]: f"another camera than that of {names[one.than]}: {one.text}" for one in odd}
-    reasons |= {mapped[key]: "has a camera of its own" for key in given}
+    for key, camera in of_maps.open.items():
+        # What an open drive says of its lens is little, but it tells a camera that was turned.
+        if key in mapped and agreeing and not may_be_one(cameras[keys[agreeing[0]]], camera):
+            other = difference(camera, cameras[keys[agreeing[0]]]).text
+            reasons[mapped[key]] = f"another camera than that of {names[agreeing[0]]}: {other}"
+    every = mapped | rejected
+    reasons |= {every[key]: "has a camera of its own" for key in of_maps.given}
+    reasons |= {every[key]: f"{storage.url}/{MAPS}/{key}: cannot be read" for key in of_maps.unreadable}
     if len(agreeing) < 2:
         few = f"expected two drives that show it and agree, found {len(agreeing)} of {len(drives)} drives"
         return CarFound(car, tuple(drive.drive.name for drive in drives), own=reasons, reason=few)
@@ -157,25 +167,41 @@ def _compared(car: str, drives: Sequence[Labelled], storage: Storage) -> CarFoun
     )
 
 
-def _cameras(keys: Sequence[str], storage: Storage) -> tuple[dict[str, DriveCamera], list[str]]:
-    """Read the cameras of maps that found theirs and closed a loop, without which the lens is a guess.
+class _Cameras(NamedTuple):
+    """Cameras that maps have, by the keys of the maps.
 
-    Returns:
-        The cameras by the keys of the maps, and the keys of those whose camera was given.
+    Attributes:
+        closed: Found by a drive that closed a loop.
+        open: Found by one that did not, so that the lens is a guess.
+        given: Maps whose camera was given.
+        unreadable: Maps of which a file is missing.
     """
-    found, given = dict[str, DriveCamera](), list[str]()
+
+    closed: dict[str, DriveCamera]
+    open: dict[str, DriveCamera]
+    given: list[str]
+    unreadable: list[str]
+
+
+def _cameras(keys: Sequence[str], storage: Storage) -> _Cameras:
+    """Read the cameras of maps."""
+    read = _Cameras({}, {}, [], [])
     files = {name: storage.read_all(MAPS, keys, name) for name in (CAMERA_NAME, "report.json")}
     with tempfile.TemporaryDirectory(prefix="lanenet-") as temporary:
         folder = Path(temporary)
         for key in keys:
+            if not all(data.get(key) for data in files.values()):
+                read.unreadable.append(key)
+                continue
             for name, data in files.items():
                 (folder / name).write_bytes(data[key])
             calibration = read_json(folder / "report.json", MapFormatError).get("calibration")
             if calibration is None:
-                given.append(key)
-            elif calibration.get("closed"):
-                found[key] = DriveCamera(key, read_camera(folder / CAMERA_NAME), camera_sigma(folder))
-    return found, given
+                read.given.append(key)
+                continue
+            camera = DriveCamera(key, read_camera(folder / CAMERA_NAME), camera_sigma(folder))
+            (read.closed if calibration.get("closed") else read.open)[key] = camera
+    return read
 
 
 def _with_result(car: CarFound, storage: Storage, failed: str) -> CarFound:
@@ -184,7 +210,10 @@ def _with_result(car: CarFound, storage: Storage, failed: str) -> CarFound:
     if result is None or result["verdict"] == REFUSED:
         reason = failed or car.reason or ("the run ended before" if result is None else result["reason"])
         return replace(car, key="", reason=reason)
-    data = storage.read(CAMERAS, car.key, CAMERA_NAME) or b""
+    data = storage.read(CAMERAS, car.key, CAMERA_NAME)
+    if not data:
+        missing = f"{storage.url}/{CAMERAS}/{car.key}/{CAMERA_NAME}: cannot be read"
+        return replace(car, key="", reason=missing)
     with tempfile.TemporaryDirectory(prefix="lanenet-") as folder:
         file = Path(folder) / CAMERA_NAME
         file.write_bytes(data)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
@@ -88,6 +88,11 @@ class _Run:
         """Map drives with the cameras of their cars, where there are any, and label all of them."""
         chosen, found_cars = list(drives), list[CarFound]()
         alone: dict[int, Labelled] = {}
+        # A recording that is listed twice gets the camera of the first: else it would be labelled twice.
+        keys = Stage(drives, self.settings, self.storage).keys[MAPS]
+        first = {place: keys.index(key) for place, key in enumerate(keys)}
+        cars = {car: [k for k in group if first[k] == k] for car, group in cars.items()}
+        cars = {car: group for car, group in cars.items() if len(group) > 1}
         if cars:
             places = [place for group in cars.values() for place in group]
             stage = self._finish(
@@ -104,6 +109,7 @@ class _Run:
                 for place in cars[car.name] if car.key else ():
                     if drives[place].name not in car.own:
                         chosen[place] = with_camera(drives[place], car, self.storage)
+        _as_the_first(chosen, first)
         stage = self._finish(Stage(chosen, self.settings, self.storage))
         worse = {
             place: stage.drives[place]
@@ -115,6 +121,7 @@ class _Run:
                 chosen[place] = drives[place]
                 car = next(car for car in found_cars if drives[place].name in car.drives)
                 car.own[drives[place].name] = _why_worse(with_it, alone[place])
+            _as_the_first(chosen, first)
             stage = self._finish(Stage(chosen, self.settings, self.storage))
         return self._ended(chosen, found_cars, stage.disk_full, stage.drives)
 
@@ -149,6 +156,14 @@ class _Run:
         standing = Stage(drives, self.settings, self.storage).look() if found is None else found
         drives_found = [replace(one, new=one.new or one.map_key in self.tried) for one in standing]
         return FleetResult(tuple(drives_found), disk_full, tuple(cars))
+
+
+def _as_the_first(drives: list[FleetDrive], first: Mapping[int, int]) -> None:
+    """Give drives that are listed twice what their first listing has of a camera."""
+    for place, at in first.items():
+        if at != place:
+            one = drives[at]
+            drives[place] = replace(drives[place], camera=one.camera, camera_height_cm=one.camera_height_cm)
 
 
 def _is_worse(found: Labelled, alone: Labelled) -> bool:

@@ -27,7 +27,7 @@ from datagen.tracks.shape import read_shape
 from datagen.tracks.visit import read_visit
 from lanenet.data.files import json_text
 from lanenet.data.maps.joined import read_joined, write_joined
-from lanenet.errors import LanenetError
+from lanenet.errors import LanenetError, TrackingLostError
 
 #: Which maps are of one track, beside the results.
 ALIKE_NAME = "alike.json"
@@ -134,7 +134,8 @@ def compare_maps(job: AlikeJob) -> dict[str, str]:
 def _grouped(mapped: Sequence[Labelled], known: Mapping[str, str]) -> dict[str, list[Labelled]]:
     """Put drives together that are of one track by name or by their maps; a track is called by its first."""
     groups: list[list[Labelled]] = []
-    for drive in mapped:
+    # Those with a name first: what is only alike finds whole tracks then, whatever the order of the drives.
+    for drive in sorted(mapped, key=lambda one: not one.drive.track):
         alike = [
             group
             for group in groups
@@ -146,14 +147,18 @@ def _grouped(mapped: Sequence[Labelled], known: Mapping[str, str]) -> dict[str, 
         ]
         names = {one.drive.track for group in alike for one in group if one.drive.track}
         if len(names | {drive.drive.track} - {""}) > 1:
-            # A drive that lies on two tracks of different names decides nothing.
-            alike = alike[:1]
+            # A drive that lies on tracks of different names decides nothing: it stays where its name says.
+            own = drive.drive.track
+            alike = [group for group in alike if own and own in {one.drive.track for one in group}]
         groups = [group for group in groups if group not in alike]
         groups.append([*(one for group in alike for one in group), drive])
     named = {}
     for group in groups:
-        name = next((one.drive.track for one in group if one.drive.track), f"track of {group[0].drive.name}")
-        named[name] = group
+        in_order = sorted(group, key=mapped.index)
+        name = next(
+            (one.drive.track for one in group if one.drive.track), f"track of {in_order[0].drive.name}"
+        )
+        named[name] = in_order
     return named
 
 
@@ -216,7 +221,8 @@ def _join(job: JoinJob) -> Outcome:
         with storage.new(TRACKS, job.key) as folder:
             try:
                 report = join_fitting(visits, folder)
-            except LanenetError as error:
+            except TrackingLostError as error:
+                # An answer, which stays; whatever else goes wrong is tried again.
                 mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
                 return Outcome(REFUSED, str(error))
             _name_places(folder, job)

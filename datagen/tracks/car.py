@@ -68,7 +68,7 @@ def agreeing_drives(cameras: Sequence[DriveCamera]) -> tuple[list[int], list[Odd
 
     @cache
     def agree(a: int, b: int) -> bool:
-        return _may_be_one(cameras[a], cameras[b])
+        return may_be_one(cameras[a], cameras[b])
 
     best: list[int] = []
     for first in order:
@@ -87,7 +87,7 @@ def agreeing_drives(cameras: Sequence[DriveCamera]) -> tuple[list[int], list[Odd
     return best, odd
 
 
-def _may_be_one(one: DriveCamera, other: DriveCamera) -> bool:
+def may_be_one(one: DriveCamera, other: DriveCamera) -> bool:
     """Tell whether two cameras may be one; cheap, since all pairs of a car's drives are compared."""
     return same_lens([one, other]) and max(map(abs, sigmas_apart(one, other).values())) <= MOST_SIGMAS
 

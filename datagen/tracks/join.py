@@ -90,8 +90,7 @@ def join_fitting(visits: Mapping[str, Visit], out: Path, progress: StageProgress
         As :func:`join_maps`; the figures also have why maps were left out, ``left_out``, by their names.
 
     Raises:
-        LanenetError: If no two are certainly of one track.
-        TrackingLostError: If the drives together show no lane.
+        TrackingLostError: If no two are certainly of one track, or the drives together show no lane.
     """
     with lock_output(out):
         check_replaceable(out, "joined")
@@ -99,7 +98,7 @@ def join_fitting(visits: Mapping[str, Visit], out: Path, progress: StageProgress
         best, left_out = _largest_track(visits, tell)
         if len(best) < 2:
             why = "; ".join(f"{name} {reason}" for name, reason in left_out.items())
-            raise LanenetError(f"no two of {len(visits)} maps are joined: {why}")
+            raise TrackingLostError(f"no two of {len(visits)} maps are joined: {why}")
         report = _join(best, out, tell)
         return replace(report, figures={**report.figures, "left_out": left_out})
 

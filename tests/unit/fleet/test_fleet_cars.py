@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import uuid
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +20,7 @@ from datagen.tracks.car import CarCamera
 from lanenet.data.camera_file import read_camera, write_camera
 
 #: What each drive's camera says of its pitch, beside the others', and how well it knows its focal length.
-PITCHES = {"knocked": 0.1, "b": 0.001, "c": 0.002}
+PITCHES = {"knocked": 0.1, "open_knocked": 0.1, "b": 0.001, "c": 0.002}
 SIGMAS = {"sharp": 0.005, "vague": 0.04}
 
 
@@ -131,6 +132,38 @@ def test_a_given_camera_stays_and_an_open_drive_gets_the_cars(tiny: Path, tmp_pa
     assert set(result.cars[0].from_drives) == {"a", "b"}
     assert result.cars[0].own == {"given": "has a camera of its own"}
     assert [drive.drive.camera is None for drive in result.drives] == [False, False, True, False]
+
+
+def test_an_open_drive_whose_camera_was_moved_keeps_its_own(tiny: Path, tmp_path: Path, by_car: list[str]):
+    result, _ = run(tmp_path / "out", red(tiny, tmp_path / "drives", "a", "b", "open_knocked"))
+    assert "another camera than that of" in result.cars[0].own["open_knocked"]
+    assert [drive.drive.camera is None for drive in result.drives] == [False, False, True]
+
+
+def test_a_given_camera_of_a_map_that_is_rejected_stays(tiny: Path, tmp_path: Path, by_car: list[str]):
+    result, _ = run(tmp_path / "out", red(tiny, tmp_path / "drives", "a", "b", "given_reject"))
+    assert result.cars[0].own == {"given_reject": "has a camera of its own"}
+    assert result.drives[2].drive.camera is None and result.drives[2].verdict == "reject"
+
+
+@pytest.mark.parametrize("name", ["knocked", "worse"])
+def test_a_recording_that_is_listed_twice_is_labelled_once(
+    tiny: Path, tmp_path: Path, by_car: list[str], name: str
+):
+    drives = red(tiny, tmp_path / "drives", "a", name, "c")
+    shutil.copytree(tmp_path / "drives" / name, tmp_path / "drives" / "again")
+    drives += [replace(drive, car="red") for drive in drives_of(tmp_path / "drives" / "again")]
+    result, names = run(tmp_path / "out", drives)
+    assert [drive.verdict for drive in result.drives] == ["good"] * 3 + ["duplicate"]
+    assert "again" not in names and result.drives[3].map_key == result.drives[1].map_key
+
+
+def test_a_map_whose_camera_file_is_gone_is_named(tiny: Path, tmp_path: Path, by_car: list[str]):
+    drives = red(tiny, tmp_path / "drives", "a", "b", "c")
+    alone, _ = run(tmp_path / "out", drives, each_alone=True)
+    (tmp_path / "out" / "maps" / alone.drives[2].map_key / "camera.yaml").unlink()
+    result, _ = run(tmp_path / "out", drives)
+    assert "cannot be read" in result.cars[0].own["c"] and set(result.cars[0].from_drives) == {"a", "b"}
 
 
 def test_a_camera_in_an_object_store_is_used_from_there(tiny: Path, by_car: list[str]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from datagen.fleet.task import FleetDrive
 from datagen.quality.figures import Report
 from datagen.tracks.recognise import Recognised
 from lanenet.data.maps.joined import FORMAT, JoinedDrive, JoinedMeta, maps_in, read_joined, write_joined
-from lanenet.errors import LanenetError
+from lanenet.errors import LanenetError, TrackingLostError
 
 RELAID = {"text": "80 cm of a line near x 10, y 20 cm: 4.0 cm between a and b"}
 
@@ -32,7 +33,7 @@ def joining(monkeypatch: pytest.MonkeyPatch, mapping: list[str]) -> list[list[st
         joined.append(list(visits))
         names = [name for name in visits if "elsewhere" not in name]
         if len(names) < 2:
-            raise LanenetError("no two of 2 maps are joined")
+            raise TrackingLostError("no two of 2 maps are joined")
         for name in names:
             shutil.copytree(visits[name].folder, out / name)
         shutil.copy(out / names[0] / "map.png", out / "map.png")
@@ -96,6 +97,45 @@ def test_maps_that_are_not_joined_are_an_answer(tiny: Path, tmp_path: Path, join
     assert result.tracks[0].reason == "no two of 2 maps are joined" and not result.tracks[0].joined
     assert [drive.verdict for drive in result.drives] == ["good", "good"]
     assert run(tmp_path / "out", drives)[1] == []
+
+
+def test_a_join_that_the_disk_has_no_room_for_is_tried_again(
+    tiny: Path, tmp_path: Path, joining: list[list[str]], monkeypatch: pytest.MonkeyPatch
+):
+    def full(visits: Mapping[str, Any], out: Path) -> Report:
+        raise LanenetError(f"{out}: cannot be written") from OSError(errno.ENOSPC, "No space left")
+
+    drives = on("hall", tiny, tmp_path, "a", "b")
+    with monkeypatch.context() as patch:
+        patch.setattr(tracks, "join_fitting", full)
+        result, _ = run(tmp_path / "out", drives)
+    assert "No space left" in result.disk_full or "cannot be written" in result.disk_full
+    result, names = run(tmp_path / "out", drives)
+    assert names == ["hall"] and result.tracks[0].joined == ("a", "b")
+
+
+@pytest.mark.parametrize(
+    "order", [("x", "both", "y", "y_too"), ("y", "x", "both", "y_too"), ("both", "y_too", "y", "x")]
+)
+def test_a_drive_that_looks_like_two_named_tracks_moves_no_drive_to_another(
+    tiny: Path,
+    tmp_path: Path,
+    joining: list[list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+    order: tuple[str, ...],
+):
+    monkeypatch.setattr(
+        tracks, "read_shape", lambda folder: json.loads((folder / "result.json").read_text())["name"]
+    )
+    monkeypatch.setattr(
+        tracks,
+        "recognise",
+        lambda one, other: Recognised("same" if "both" in (one, other) else "different", ""),
+    )
+    named = {"x": "hall", "y": "yard", "y_too": "yard", "both": ""}
+    drives = [drive for name in order for drive in on(named[name], tiny, tmp_path, name)]
+    result, _ = run(tmp_path / "out", drives, find_tracks=True)
+    assert [(track.name, set(track.joined)) for track in result.tracks] == [("yard", {"y", "y_too"})]
 
 
 def test_tracks_without_a_name_are_recognised_and_no_pair_is_compared_twice(
