@@ -136,12 +136,19 @@ def test_zeros_of_a_power_cut_are_left_out(tmp_path: Path) -> None:
 def test_a_slow_card_holds_nobody_and_leaves_gaps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    held = threading.Event()
-    monkeypatch.setattr(drive_recorder, "sync_path", lambda _: held.wait(10.0))
+    holding, held = threading.Event(), threading.Event()
+
+    def hold(_: object) -> None:
+        holding.set()
+        held.wait(10.0)
+
+    monkeypatch.setattr(drive_recorder, "sync_path", hold)
     recorder = DriveRecorder(tmp_path / "one", settings(queue_frames=3))
     with caplog.at_level(logging.WARNING):
+        recorder.add(picture(0), 0.0)
+        assert holding.wait(10.0)
         longest_s = 0.0
-        for k in range(50):
+        for k in range(1, 50):
             begin_s = time.monotonic()
             recorder.add(picture(k), 0.05 * k)
             longest_s = max(longest_s, time.monotonic() - begin_s)

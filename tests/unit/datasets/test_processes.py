@@ -57,7 +57,7 @@ def threads_used() -> int:
 
     def wait(_: int) -> int:
         with contextlib.suppress(threading.BrokenBarrierError):
-            together.wait(0.1)
+            together.wait(1.0)
         return threading.get_ident()
 
     return len(set(in_threads(wait, range(2))))
