@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.lanes.find import MappedSegment
-from datagen.lanes.path import distances_seen
 from datagen.lanes.scale import LaneWidth, ahead_sigma, fitted_width
 from datagen.prepare import PreparedDrive
 from datagen.slam.camera.coarse import with_known_scale
+from datagen.slam.odometry.scans import distances_seen
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.geometry.camera import Camera

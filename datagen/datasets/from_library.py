@@ -49,10 +49,11 @@ def with_library(data: DataSettings) -> tuple[DataSettings, list[str]]:
     part_of = parts_of_tracks({entry.track for entry in entries}, chosen)
     often = {"counts_as": chosen.counts_as, "weight": chosen.weight}
     drives = [
-        _recorded(library, entry, paths[entry.name], part_of[entry.track], finished=bool(chosen.labelled))
+        _recorded(
+            library, entry, paths[entry.name], part_of[entry.track], finished=bool(chosen.labelled)
+        ).model_copy(update=often)
         for entry in entries
     ]
-    drives = [drive.model_copy(update=often) for drive in drives]
     for role in ROLES:
         tracks = sorted(track for track, part in part_of.items() if part == role)
         count = sum(drive.split == role for drive in drives)

@@ -5,25 +5,22 @@ from __future__ import annotations
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from datagen.fleet.engine import Engine, Task
-from datagen.fleet.memory import memory_together
+from datagen.fleet.engine import Engine
 from datagen.fleet.meter import Meter
 from datagen.fleet.result import CarFound, Labelled
-from datagen.fleet.source import on_this_machine
+from datagen.fleet.several import SeveralJob, finish, visits_of
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import CAMERAS, MAPS, FleetDrive
 from datagen.fleet.work import REFUSED, REJECTED, Outcome, attempted, mark, version
 from datagen.made import key_of
-from datagen.tracks.cameras import DriveCamera, camera_sigma, difference
-from datagen.tracks.car import agreeing_drives, camera_of_car, may_be_one
-from datagen.tracks.visit import read_visit
+from datagen.tracks.cameras import DriveCamera, camera_sigma
+from datagen.tracks.car import agreeing_drives, camera_of_car, may_be_one, unlike
 from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.errors import MapFormatError, TrackingLostError
 from lanenet.reading import read_json
@@ -32,25 +29,6 @@ CAMERA_NAME = "camera.yaml"
 #: A camera is found from so many drives at most, those that know the focal length best. Chosen: more drives
 #: make it hardly better known, and a drive that is new changes nothing unless it is one of the best.
 _MOST_DRIVES = 4
-
-
-@dataclass(frozen=True)
-class CameraJob:
-    """What a worker needs to find the camera of a car.
-
-    Attributes:
-        car: Name of the car.
-        drives: Drives, with the keys of their maps.
-        out: Path or URL of the storage.
-        key: Of the result.
-        made_by: The :func:`datagen.fleet.work.version` of the program that wants it.
-    """
-
-    car: str
-    drives: tuple[tuple[FleetDrive, str], ...]
-    out: str
-    key: str
-    made_by: str
 
 
 def without_camera(drives: Sequence[FleetDrive]) -> dict[str, list[int]]:
@@ -76,57 +54,34 @@ def find_cameras(
         The cars, and which disk was full.
     """
     found = [_compared(car, drives, storage) for car, drives in cars.items()]
-    jobs = {}
-    for place, car in enumerate(found):
-        if car.key and storage.result(CAMERAS, car.key) is None:
-            drives = {drive.map_key: drive.drive for drive in cars[car.name]}
-            chosen = tuple((drives[key], key) for key in car.from_maps)
-            jobs[place] = CameraJob(car.name, chosen, storage.url, car.key, version())
-    failed, disk_full = dict[int, str](), ""
-    if jobs:
-        # All drives are in memory together.
-        tasks = [
-            Task(f"camera of {job.car}", job, memory_together(drive.source for drive, _ in job.drives))
-            for job in jobs.values()
-        ]
-        places = list(jobs)
-        with closing(engine.run(find_camera, tasks)) as running:
-            for end in running:
-                outcome = Outcome("", end.error) if end.error else end.result
-                if not outcome.verdict:
-                    failed[places[end.number]] = outcome.reason
-                if outcome.disk_full:
-                    disk_full = outcome.reason
-                    break
-    return [_with_result(car, storage, failed.get(k, "")) for k, car in enumerate(found)], disk_full
+    jobs = []
+    for car in found:
+        drives = {drive.map_key: drive.drive for drive in cars[car.name]}
+        chosen = tuple((drives[key], key) for key in car.from_maps)
+        if car.key:
+            jobs.append(SeveralJob(car.name, chosen, storage.url, car.key, version()))
+    failed, disk_full = finish(jobs, CAMERAS, find_camera, storage, engine, "camera of ")
+    return [_with_result(car, storage, failed.get(car.key, "")) for car in found], disk_full
 
 
-def find_camera(job: CameraJob) -> Outcome:
+def find_camera(job: SeveralJob) -> Outcome:
     """Find the camera of a car from its drives; a function of a module, since workers call it."""
     return attempted(job.made_by, lambda: _find_camera(job))
 
 
-def _find_camera(job: CameraJob) -> Outcome:
+def _find_camera(job: SeveralJob) -> Outcome:
     storage, meter = Storage(job.out), Meter()
-    marker = {"car": job.car, "drives": [drive.name for drive, _ in job.drives]}
-    with ExitStack() as stack:
-        visits = [
-            read_visit(
-                stack.enter_context(storage.fetched(MAPS, key)),
-                stack.enter_context(on_this_machine(drive.source)),
-            )
-            for drive, key in job.drives
-        ]
-        with storage.new(CAMERAS, job.key) as folder:
-            try:
-                found = camera_of_car(visits, np.random.default_rng(visits[0].prepared.settings.seed))
-            except TrackingLostError as error:
-                mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
-                return Outcome(REFUSED, str(error))
-            names = ", ".join(drive.name for drive, _ in job.drives)
-            write_camera(folder / CAMERA_NAME, found.camera, f"from {names} together")
-            facts = {"sigma": found.sigma, "heights_cm": [None if h != h else h for h in found.height_cm]}
-            mark(folder, {**marker, "verdict": "found", "reason": "", **facts}, meter)
+    marker = {"car": job.name, "drives": [drive.name for drive, _ in job.drives]}
+    with visits_of(job, storage) as by_name, storage.new(CAMERAS, job.key) as folder:
+        visits = list(by_name.values())
+        try:
+            found = camera_of_car(visits, np.random.default_rng(visits[0].prepared.settings.seed))
+        except TrackingLostError as error:
+            mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
+            return Outcome(REFUSED, str(error))
+        write_camera(folder / CAMERA_NAME, found.camera, f"from {', '.join(by_name)} together")
+        facts = {"sigma": found.sigma, "heights_cm": [None if h != h else h for h in found.height_cm]}
+        mark(folder, {**marker, "verdict": "found", "reason": "", **facts}, meter)
     return Outcome("found")
 
 
@@ -148,7 +103,7 @@ def _compared(car: str, drives: Sequence[Labelled], storage: Storage) -> CarFoun
     for key, camera in of_maps.open.items():
         # What an open drive says of its lens is little, but it tells a camera that was turned.
         if key in mapped and agreeing and not may_be_one(cameras[keys[agreeing[0]]], camera):
-            other = difference(camera, cameras[keys[agreeing[0]]]).text
+            other = unlike(camera, cameras[keys[agreeing[0]]])
             reasons[mapped[key]] = f"another camera than that of {names[agreeing[0]]}: {other}"
     every = mapped | rejected
     reasons |= {every[key]: "has a camera of its own" for key in of_maps.given}

@@ -89,9 +89,8 @@ class _Run:
         chosen, found_cars = list(drives), list[CarFound]()
         alone: dict[int, Labelled] = {}
         # A recording that is listed twice gets the camera of the first: else it would be labelled twice.
-        keys = Stage(drives, self.settings, self.storage).keys[MAPS]
-        first = {place: keys.index(key) for place, key in enumerate(keys)}
-        cars = {car: [k for k in group if first[k] == k] for car, group in cars.items()}
+        first = self._first_listings(drives) if cars else {}
+        cars = {car: [k for k in group if k not in first] for car, group in cars.items()}
         cars = {car: group for car, group in cars.items() if len(group) > 1}
         if cars:
             places = [place for group in cars.values() for place in group]
@@ -135,6 +134,14 @@ class _Run:
         found, disk_full = join_tracks(tracks, self.storage, self.engine)
         return replace(result, tracks=tuple(found), disk_full=disk_full)
 
+    def _first_listings(self, drives: Sequence[FleetDrive]) -> dict[int, int]:
+        """Return for drives that were listed before, by their places, where that was."""
+        first, again = dict[str, int](), dict[int, int]()
+        for place, key in enumerate(Stage(drives, self.settings, self.storage).keys[MAPS]):
+            if first.setdefault(key, place) != place:
+                again[place] = first[key]
+        return again
+
     def _finish(self, stage: Stage) -> Finished:
         if self.refused_again:
             again = stage.refused_keys() - self.tried
@@ -161,9 +168,8 @@ class _Run:
 def _as_the_first(drives: list[FleetDrive], first: Mapping[int, int]) -> None:
     """Give drives that are listed twice what their first listing has of a camera."""
     for place, at in first.items():
-        if at != place:
-            one = drives[at]
-            drives[place] = replace(drives[place], camera=one.camera, camera_height_cm=one.camera_height_cm)
+        one = drives[at]
+        drives[place] = replace(drives[place], camera=one.camera, camera_height_cm=one.camera_height_cm)
 
 
 def _is_worse(found: Labelled, alone: Labelled) -> bool:

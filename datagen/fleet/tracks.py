@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,18 +13,16 @@ from typing import Any
 import numpy as np
 
 from datagen.fleet.engine import Engine, Task
-from datagen.fleet.memory import memory_together
 from datagen.fleet.meter import Meter
 from datagen.fleet.result import Labelled, TrackFound
-from datagen.fleet.source import on_this_machine
+from datagen.fleet.several import SeveralJob, finish, visits_of
 from datagen.fleet.storage import Storage
-from datagen.fleet.task import MAPS, TRACKS, FleetDrive
+from datagen.fleet.task import MAPS, TRACKS
 from datagen.fleet.work import REFUSED, Outcome, attempted, mark, name_source, shrink_picture, version
 from datagen.made import key_of
 from datagen.tracks.join import join_fitting
 from datagen.tracks.recognise import recognise
 from datagen.tracks.shape import read_shape
-from datagen.tracks.visit import read_visit
 from lanenet.data.files import json_text
 from lanenet.data.maps.joined import read_joined, write_joined
 from lanenet.errors import LanenetError, TrackingLostError
@@ -46,25 +44,6 @@ class AlikeJob:
     key: str
     others: tuple[str, ...]
     out: str
-    made_by: str
-
-
-@dataclass(frozen=True)
-class JoinJob:
-    """What a worker needs to join maps.
-
-    Attributes:
-        track: Name of the track.
-        drives: Its drives, with the keys of their maps.
-        out: Path or URL of the storage.
-        key: Of the result.
-        made_by: The :func:`datagen.fleet.work.version` of the program that wants it.
-    """
-
-    track: str
-    drives: tuple[tuple[FleetDrive, str], ...]
-    out: str
-    key: str
     made_by: str
 
 
@@ -176,65 +155,43 @@ def join_tracks(
         The tracks, and which disk was full.
     """
     jobs = [_job(name, drives, storage) for name, drives in tracks.items() if len(drives) > 1]
-    missing = [job for job in jobs if storage.result(TRACKS, job.key) is None]
-    failed, disk_full = dict[str, str](), ""
-    if missing:
-        # All drives are in memory together.
-        tasks = [
-            Task(job.track, job, memory_together(drive.source for drive, _ in job.drives)) for job in missing
-        ]
-        with closing(engine.run(join_drives, tasks)) as running:
-            for end in running:
-                outcome = Outcome("", end.error) if end.error else end.result
-                if not outcome.verdict:
-                    failed[missing[end.number].key] = outcome.reason
-                if outcome.disk_full:
-                    disk_full = outcome.reason
-                    break
-    return [_found(job, len(tracks[job.track]), storage, failed.get(job.key, "")) for job in jobs], disk_full
+    failed, disk_full = finish(jobs, TRACKS, join_drives, storage, engine)
+    return [_found(job, len(tracks[job.name]), storage, failed.get(job.key, "")) for job in jobs], disk_full
 
 
-def _job(name: str, drives: Sequence[Labelled], storage: Storage) -> JoinJob:
+def _job(name: str, drives: Sequence[Labelled], storage: Storage) -> SeveralJob:
     """Choose the maps that are joined; their order, and so the frame of the track, is that of the drives."""
     places = np.unique(np.linspace(0, len(drives) - 1, min(len(drives), _MOST_JOINED)).astype(int))
     chosen = tuple((drives[k].drive, drives[k].map_key) for k in places)
     key = key_of(TRACKS, [(drive.name, map_key) for drive, map_key in chosen])
-    return JoinJob(name, chosen, storage.url, key, version())
+    return SeveralJob(name, chosen, storage.url, key, version())
 
 
-def join_drives(job: JoinJob) -> Outcome:
+def join_drives(job: SeveralJob) -> Outcome:
     """Join the maps of a track; a function of a module, since workers call it."""
     return attempted(job.made_by, lambda: _join(job))
 
 
-def _join(job: JoinJob) -> Outcome:
+def _join(job: SeveralJob) -> Outcome:
     storage, meter = Storage(job.out), Meter()
-    marker: dict[str, Any] = {"track": job.track, "drives": [drive.name for drive, _ in job.drives]}
-    with ExitStack() as stack:
-        visits = {
-            drive.name: read_visit(
-                stack.enter_context(storage.fetched(MAPS, key)),
-                stack.enter_context(on_this_machine(drive.source)),
-            )
-            for drive, key in job.drives
-        }
-        with storage.new(TRACKS, job.key) as folder:
-            try:
-                report = join_fitting(visits, folder)
-            except TrackingLostError as error:
-                # An answer, which stays; whatever else goes wrong is tried again.
-                mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
-                return Outcome(REFUSED, str(error))
-            _name_places(folder, job)
-            shrink_picture(folder)
-            figures = report.figures
-            facts = {name: figures[name] for name in ("left_out", "lane_cm", "shared_camera", "relaid")}
-            joined = list(figures["drives"])
-            mark(folder, {**marker, "verdict": "joined", "reason": "", "joined": joined, **facts}, meter)
+    marker: dict[str, Any] = {"track": job.name, "drives": [drive.name for drive, _ in job.drives]}
+    with visits_of(job, storage) as visits, storage.new(TRACKS, job.key) as folder:
+        try:
+            report = join_fitting(visits, folder)
+        except TrackingLostError as error:
+            # An answer, which stays; whatever else goes wrong is tried again.
+            mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
+            return Outcome(REFUSED, str(error))
+        _name_places(folder, job)
+        shrink_picture(folder)
+        figures = report.figures
+        facts = {name: figures[name] for name in ("left_out", "lane_cm", "shared_camera", "relaid")}
+        joined = list(figures["drives"])
+        mark(folder, {**marker, "verdict": "joined", "reason": "", "joined": joined, **facts}, meter)
     return Outcome("joined")
 
 
-def _name_places(folder: Path, job: JoinJob) -> None:
+def _name_places(folder: Path, job: SeveralJob) -> None:
     """Let joined maps name their drives and maps by the places where they lie for all machines."""
     keys = {drive.name: key for drive, key in job.drives}
     for drive, _ in job.drives:
@@ -248,9 +205,9 @@ def _name_places(folder: Path, job: JoinJob) -> None:
     write_joined(folder, meta.model_copy(update={"drives": drives}))
 
 
-def _found(job: JoinJob, count: int, storage: Storage, failed: str) -> TrackFound:
+def _found(job: SeveralJob, count: int, storage: Storage, failed: str) -> TrackFound:
     """Return what became of a track."""
-    found = TrackFound(job.track, count, job.key, tuple(drive.name for drive, _ in job.drives))
+    found = TrackFound(job.name, count, job.key, tuple(drive.name for drive, _ in job.drives))
     result = storage.result(TRACKS, job.key) if not failed else None
     if result is None or result["verdict"] == REFUSED:
         return replace(

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from datagen.lanes.lap import stitched_road, with_long_steps_filled
 from datagen.slam.loops.consistency import of_one_lap
-from datagen.slam.odometry.scans import Scans
+from datagen.slam.odometry.scans import Scans, distances_seen
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.frames import wrap_angle
 from lanenet.geometry.poses import path_lengths
@@ -300,16 +300,6 @@ class MapEdges:
     def towards_dark(self) -> MapEdges:
         """Return the points with normals to the darker side, as :meth:`PathEdges.towards_dark`."""
         return replace(self, normals=-self.normals)
-
-
-def distances_seen(points_cm: Float[np.ndarray, "m 2"], lead_cm: float) -> Float[np.ndarray, "m"]:
-    """Distances of points from the front axle, or from the foot of a camera that is further ahead.
-
-    Args:
-        points_cm: Points, frame car.
-        lead_cm: Of the camera, see :attr:`lanenet.geometry.camera.Mounting.lead_cm`.
-    """
-    return np.hypot(points_cm[:, 0], points_cm[:, 1] - lead_cm)
 
 
 def edges_on_map(

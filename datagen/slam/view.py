@@ -133,8 +133,10 @@ def with_measured_periods(view: SegmentView) -> SegmentView:
 
     A recorded speed knows the steps better.
     """
+    if view.commands.speed_known:
+        return view
     early = early_frames(view.drive)
-    if view.commands.speed_known or not early.any():
+    if not early.any():
         return view
     periods, uneven = measured_periods(view.images, view.typical.step_heights, early)
     images = view.images.with_periods(np.where(uneven, periods, view.images.periods))

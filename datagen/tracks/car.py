@@ -83,7 +83,7 @@ def agreeing_drives(cameras: Sequence[DriveCamera]) -> tuple[list[int], list[Odd
     odd = []
     for place in sorted(set(order) - set(best)):
         than = next(k for k in best if not agree(min(place, k), max(place, k)))
-        odd.append(Odd(place, than, _unlike(cameras[place], cameras[than])))
+        odd.append(Odd(place, than, unlike(cameras[place], cameras[than])))
     return best, odd
 
 
@@ -92,7 +92,7 @@ def may_be_one(one: DriveCamera, other: DriveCamera) -> bool:
     return same_lens([one, other]) and max(map(abs, sigmas_apart(one, other).values())) <= MOST_SIGMAS
 
 
-def _unlike(one: DriveCamera, other: DriveCamera) -> str:
+def unlike(one: DriveCamera, other: DriveCamera) -> str:
     """Say how two cameras differ."""
     if not same_lens([one, other]):
         return "images of another size or lens"

@@ -175,7 +175,7 @@ class LaneController:
         """
         width_cm = self._memory.width_cm
         fastest_cm_s = max(speed_cm_s, self._settings.speed.cruise_cm_s)
-        impossible = fault_of(estimate, None)
+        impossible = fault_of(estimate)
         # A frame of another width counts as well: else a wrong one, once learned, would refuse all others.
         if self._settings.width_memory and not impossible and estimate.confidence >= _WIDTH_CONFIDENCE:
             self._memory.learn(estimate.points_cm, estimate.presence)

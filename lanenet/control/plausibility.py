@@ -38,17 +38,15 @@ _AT = ROWS_CM.index(15.0)
 _ROUNDING_S = 1e-6
 
 
-def fault_of(estimate: LaneEstimate, width_cm: float | None) -> str:
+def fault_of(estimate: LaneEstimate) -> str:
     """Return what makes an answer impossible in itself; empty if nothing does.
 
     Args:
         estimate: The lane of one frame.
-        width_cm: The lane's width; None while it is unknown.
 
     Returns:
         A value that is not finite or out of range (NaN is a known absence, of all sigmas or none), a point
-        out of reach, lines that cross, a lane too narrow or too wide, or beside the car; where one line is
-        missing, it lies a width beside the other.
+        out of reach, or lines that cross.
     """
     points, sigmas = estimate.points_cm.tolist(), estimate.sigma_cm.tolist()
     if not 0.0 <= estimate.confidence <= 1.0:
@@ -64,7 +62,7 @@ def fault_of(estimate: LaneEstimate, width_cm: float | None) -> str:
         return f"sigma {known}"
     if any(right <= left for left, right in zip(points[:3], points[3:], strict=True)):
         return "lines that cross"
-    return "" if width_cm is None else misfit_of(estimate, width_cm)
+    return ""
 
 
 def misfit_of(estimate: LaneEstimate, width_cm: float) -> str:
@@ -73,6 +71,10 @@ def misfit_of(estimate: LaneEstimate, width_cm: float) -> str:
     Args:
         estimate: The lane of one frame.
         width_cm: The lane's width.
+
+    Returns:
+        A lane too narrow or too wide, or beside the car; where one line is missing, it lies a width beside
+        the other.
     """
     seen_cm = lane_width_cm(estimate.points_cm)
     if not math.isnan(seen_cm) and not _NARROWEST * width_cm <= seen_cm <= _WIDEST * width_cm:

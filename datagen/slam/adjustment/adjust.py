@@ -548,8 +548,7 @@ def frame_priors(
     b = a + 1
     both_at = np.concatenate([step_at[b], step_at[a]], axis=1)
     # Steps per commanded step; nothing is assumed of steps for which the car was commanded to stand.
-    commanded = np.ones(n) if observed.relative_steps is None else observed.relative_steps
-    commanded = commanded[j]
+    commanded = (np.ones(n) if observed.relative_steps is None else observed.relative_steps)[j]
     per = np.where(commanded > 0.0, 1.0 / np.maximum(commanded, _LEAST_STEP), 0.0)
     per_a, per_b = per[a] * (per[b] > 0.0), per[b] * (per[a] > 0.0)
     speed_by = np.concatenate([per_b[:, None] * along_by[b], -per_a[:, None] * along_by[a]], axis=1)

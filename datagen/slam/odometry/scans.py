@@ -160,6 +160,16 @@ def lift_tilted(
     return [RoadEdges(points[a:b], across[a:b]) for a, b in pairwise(ends.tolist())]
 
 
+def distances_seen(points_cm: Float[np.ndarray, "m 2"], lead_cm: float) -> Float[np.ndarray, "m"]:
+    """Distances of points from the front axle, or from the foot of a camera that is further ahead.
+
+    Args:
+        points_cm: Points, frame car.
+        lead_cm: Of the camera, see :attr:`lanenet.geometry.camera.Mounting.lead_cm`.
+    """
+    return np.hypot(points_cm[:, 0], points_cm[:, 1] - lead_cm)
+
+
 def pack_scans(frames: list[RoadEdges], camera_height_cm: float, lead_cm: float = 0.0) -> Scans:
     """Pack per-frame edge points, and weigh them by their distance.
 
@@ -176,7 +186,7 @@ def pack_scans(frames: list[RoadEdges], camera_height_cm: float, lead_cm: float 
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     points = np.concatenate([np.empty((0, 2)), *(frame.points_cm for frame in frames)])
     normals = np.concatenate([np.empty((0, 2)), *(frame.normals for frame in frames)])
-    distance = np.hypot(points[:, 0], points[:, 1] - lead_cm) / (_HALF_WEIGHT_HEIGHTS * camera_height_cm)
+    distance = distances_seen(points, lead_cm) / (_HALF_WEIGHT_HEIGHTS * camera_height_cm)
     return Scans(points, normals, 1.0 / (1.0 + distance**4), starts)
 
 

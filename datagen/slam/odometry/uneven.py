@@ -31,8 +31,10 @@ def early_frames(drive: Drive) -> Bool[np.ndarray, "n"]:
     """Find the frames that hardly differ from the one before, though those around them do."""
     n = len(drive)
     shift_px = np.full(n, np.nan)
+    after = drive.image(0)
     for k in range(1, n):
-        shift_px[k] = edge_shift_px(drive.image(k - 1), drive.image(k))
+        before, after = after, drive.image(k)
+        shift_px[k] = edge_shift_px(before, after)
     early = np.zeros(n, dtype=bool)
     for k in range(1 + _AROUND, n - _AROUND):
         around = np.concatenate([shift_px[k - _AROUND : k], shift_px[k + 1 : k + 1 + _AROUND]])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lanenet.control.controller import ControlSettings, LaneController
-from lanenet.control.plausibility import SETTLE_S, fault_of
+from lanenet.control.plausibility import SETTLE_S, fault_of, misfit_of
 from lanenet.control.steering import SteeringSettings
 from lanenet.perception.estimate import LaneEstimate
 
@@ -61,7 +61,7 @@ def only_right(x_cm: float) -> LaneEstimate:
     ],
 )
 def test_an_answer_that_cannot_be_the_lane_is_none(answer: LaneEstimate, word: str) -> None:
-    assert word in fault_of(answer, 40.0)
+    assert word in (fault_of(answer) or misfit_of(answer, 40.0))
     target = controller().target(answer, 1.0)
     assert word in target.fault and math.isnan(target.steering_rad)
 
@@ -79,7 +79,7 @@ def test_an_answer_that_cannot_be_the_lane_is_none(answer: LaneEstimate, word: s
     ],
 )
 def test_what_a_detector_does_not_know_is_no_fault(answer: LaneEstimate) -> None:
-    assert fault_of(answer, 40.0) == "" == fault_of(answer, None)
+    assert fault_of(answer) == "" == misfit_of(answer, 40.0)
 
 
 def faults(offsets_cm: list[float], step_s: float = STEP_S, **changes: object) -> list[bool]:
