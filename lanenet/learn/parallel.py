@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.distributed import Store, TCPStore  # type: ignore[attr-defined]
+from torch.distributed import PrefixStore, Store, TCPStore  # type: ignore[attr-defined]
 
 from lanenet.errors import ConfigError, LanenetError, counted
 from lanenet.processes import one_thread_each, prepare_process
@@ -232,13 +232,27 @@ def _joined_by_torchrun() -> Iterator[Processes]:
     )
     uses_gpu = torch.cuda.is_available() and torch.cuda.device_count() >= local_size
     try:
-        with _joined(None, rank, size, uses_gpu, local_rank) as processes:
+        store = _store_of_this_start() if local_size == size and _torchrun_keeps_a_store() else None
+        with _joined(store, rank, size, uses_gpu, local_rank) as processes:
             yield processes
     except LostProcessError:
         raise LostProcessError(
             f"process {rank + 1} of {size}: another process of the training has ended; what is finished is "
             "kept: run the command again, or give torchrun --max-restarts"
         ) from None
+
+
+def _store_of_this_start() -> Store:
+    """Return a store that processes of an earlier start did not write to.
+
+    torchrun keeps one store for all starts, where a process that is started again may find the address of
+    one that has ended. On several machines the counts of starts can differ, so they cannot tell starts apart.
+    """
+    with _noticing():
+        store = TCPStore(
+            os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=False, timeout=_PATIENCE
+        )
+    return PrefixStore(f"start {os.environ['TORCHELASTIC_RESTART_COUNT']}", store)
 
 
 @contextmanager
@@ -308,6 +322,10 @@ def _check_gpus(count: int, uses_gpu: bool) -> None:
             f"learn.processes: {count}, but PyTorch finds {counted(found, 'GPU')}; expected one each, or "
             "learn.device cpu"
         )
+
+
+def _torchrun_keeps_a_store() -> bool:
+    return os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
 
 
 def _by_torchrun() -> bool:
