@@ -41,7 +41,7 @@ def without_camera(drives: Sequence[FleetDrive]) -> dict[str, list[int]]:
 
 
 def find_cameras(
-    cars: dict[str, list[Labelled]], storage: Storage, engine: Engine
+    cars: dict[str, list[Labelled]], storage: Storage, engine: Engine, refused_again: bool = False
 ) -> tuple[list[CarFound], str]:
     """Find the camera of each car, unless that was done before.
 
@@ -49,6 +49,7 @@ def find_cameras(
         cars: The drives of each car, mapped alone.
         storage: Where results are kept.
         engine: What spreads the work.
+        refused_again: Look for cameras again where none was found before.
 
     Returns:
         The cars, and which disk was full.
@@ -60,7 +61,7 @@ def find_cameras(
         chosen = tuple((drives[key], key) for key in car.from_maps)
         if car.key:
             jobs.append(SeveralJob(car.name, chosen, storage.url, car.key, version()))
-    failed, disk_full = finish(jobs, CAMERAS, find_camera, storage, engine, "camera of ")
+    failed, disk_full = finish(jobs, CAMERAS, find_camera, storage, engine, "camera of ", refused_again)
     return [_with_result(car, storage, failed.get(car.key, "")) for car in found], disk_full
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from datagen.fleet.result import DUPLICATE, FAILED, LEFT, CarFound, FleetResult, Labelled, TrackFound
+from datagen.fleet.result import DUPLICATE, FAILED, LEFT, CarFound, FleetResult, Labelled
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import MAPS, TRACKS
 from datagen.fleet.work import REFUSED, REJECTED, THUMBNAIL_NAME
@@ -65,7 +65,7 @@ def fleet_page(result: FleetResult, thumbnails: Mapping[str, bytes]) -> str:
         note(f"{result.disk_full}.") if result.disk_full else "",
         *_reasons(result),
         *_cars(result.cars),
-        *_tracks(result.tracks, thumbnails),
+        *_tracks(result, thumbnails),
         section("Maps"),
         *(
             part
@@ -156,13 +156,13 @@ def _cars(cars: Sequence[CarFound]) -> list[str]:
     return [section("Cars"), table(rows), bullets(lines[:_MOST_LINES]) if lines else ""]
 
 
-def _tracks(tracks: Sequence[TrackFound], thumbnails: Mapping[str, bytes]) -> list[str]:
+def _tracks(result: FleetResult, thumbnails: Mapping[str, bytes]) -> list[str]:
     """Show the joined map of each track, what was not joined, and where lines were laid anew."""
-    if not tracks:
+    if not (result.tracks or result.uncompared):
         return []
     rows: list[Row] = [("track", "drives with maps", "joined", "lane", "laid anew")]
-    lines, pictures = [], []
-    for track in tracks[:_MOST_LINES]:
+    lines, pictures = [f"could not be compared: {text}" for text in result.uncompared], []
+    for track in result.tracks[:_MOST_LINES]:
         lane = "-" if track.lane_cm is None else f"{track.lane_cm:.1f} cm"
         counts = (str(track.count), str(len(track.joined)))
         rows.append((track.name, *counts, lane, str(len(track.relaid))))

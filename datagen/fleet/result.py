@@ -112,12 +112,14 @@ class FleetResult:
         disk_full: Which disk ended the run, being full.
         cars: Cars with several drives.
         tracks: Tracks with several drives.
+        uncompared: Which maps could not be compared with others, and why.
     """
 
     drives: tuple[Labelled, ...]
     disk_full: str = ""
     cars: tuple[CarFound, ...] = ()
     tracks: tuple[TrackFound, ...] = ()
+    uncompared: tuple[str, ...] = ()
 
     def of(self, *verdicts: str) -> list[Labelled]:
         """Return the drives with one of the verdicts."""

@@ -46,7 +46,7 @@ def label_all(
         storage: Where results are kept; no other run may write there.
         engine: What spreads the tasks.
         progress: Called whenever a drive has ended; counts begin anew with each stage.
-        refused_again: Try drives again that were refused before.
+        refused_again: Try drives, cameras and joins again that were refused before.
         each_alone: Neither look for cameras of cars nor join maps.
         find_tracks: Recognise the track of drives that name none, which compares all pairs of maps.
 
@@ -101,7 +101,7 @@ class _Run:
             disk_full = stage.disk_full
             if not disk_full:
                 groups = {car: [alone[k] for k in group] for car, group in cars.items()}
-                found_cars, disk_full = find_cameras(groups, self.storage, self.engine)
+                found_cars, disk_full = find_cameras(groups, self.storage, self.engine, self.refused_again)
             if disk_full:
                 return self._ended(chosen, found_cars, disk_full)
             for car in found_cars:
@@ -126,13 +126,11 @@ class _Run:
 
     def join(self, result: FleetResult, find_tracks: bool) -> FleetResult:
         """Join the maps of each track."""
-        tracks = (
-            recognised_tracks(result.drives, self.storage, self.engine)
-            if find_tracks
-            else named_tracks(result.drives)
-        )
-        found, disk_full = join_tracks(tracks, self.storage, self.engine)
-        return replace(result, tracks=tuple(found), disk_full=disk_full)
+        tracks, failed = named_tracks(result.drives), list[str]()
+        if find_tracks:
+            tracks, failed = recognised_tracks(result.drives, self.storage, self.engine)
+        found, disk_full = join_tracks(tracks, self.storage, self.engine, self.refused_again)
+        return replace(result, tracks=tuple(found), uncompared=tuple(failed), disk_full=disk_full)
 
     def _first_listings(self, drives: Sequence[FleetDrive]) -> dict[int, int]:
         """Return for drives that were listed before, by their places, where that was."""

@@ -11,7 +11,7 @@ from datagen.fleet.memory import memory_together
 from datagen.fleet.source import on_this_machine
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import MAPS, FleetDrive
-from datagen.fleet.work import Outcome
+from datagen.fleet.work import REFUSED, Outcome
 from datagen.tracks.visit import Visit, read_visit
 
 
@@ -41,6 +41,7 @@ def finish(
     storage: Storage,
     engine: Engine,
     what: str = "",
+    refused_again: bool = False,
 ) -> tuple[dict[str, str], str]:
     """Do the jobs that have no result.
 
@@ -51,10 +52,14 @@ def finish(
         storage: Where results are kept.
         engine: What spreads the work.
         what: Goes before the names of the jobs, in those of the tasks.
+        refused_again: Do those again, too, whose result is a refusal.
 
     Returns:
         Why jobs failed, by the keys of their results, and which disk was full.
     """
+    if refused_again:
+        results = storage.results(kind, [job.key for job in jobs])
+        storage.sweep(kind, [key for key, result in results.items() if result["verdict"] == REFUSED])
     missing = [job for job in jobs if storage.result(kind, job.key) is None]
     failed, disk_full = dict[str, str](), ""
     if not missing:

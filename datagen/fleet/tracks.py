@@ -58,8 +58,8 @@ def named_tracks(drives: Sequence[Labelled]) -> dict[str, list[Labelled]]:
 
 def recognised_tracks(
     drives: Sequence[Labelled], storage: Storage, engine: Engine
-) -> dict[str, list[Labelled]]:
-    """Return the mapped drives of each track; those whose track has no name are recognised by their maps.
+) -> tuple[dict[str, list[Labelled]], list[str]]:
+    """Recognise drives of one track by their maps, where their track has no name.
 
     Pairs that were compared before are not compared again.
 
@@ -67,10 +67,13 @@ def recognised_tracks(
         drives: All drives.
         storage: Where results are kept.
         engine: What spreads the work.
+
+    Returns:
+        The mapped drives of each track; and why maps could not be compared, which the next run does again.
     """
     mapped = [drive for drive in drives if drive.has_labels]
     known: dict[str, str] = json.loads(storage.read(ALIKE_NAME) or b"{}")
-    tasks = []
+    tasks, failed = list[Task](), list[str]()
     for place, drive in enumerate(mapped):
         before = [one for one in mapped[:place] if not (one.drive.track and drive.drive.track)]
         others = [one.map_key for one in before if _pair(drive.map_key, one.map_key) not in known]
@@ -80,12 +83,13 @@ def recognised_tracks(
     if tasks:
         with closing(engine.run(compare_maps, tasks)) as running:
             for end in running:
-                job = tasks[end.number].input
-                # What could not be compared is not known to be alike, and is compared again in the next run.
-                for other, answer in (end.result or {}).items():
-                    known[_pair(job.key, other)] = answer
-        storage.write(ALIKE_NAME, json_text(dict(sorted(known.items()))).encode())
-    return _grouped(mapped, known)
+                task = tasks[end.number]
+                if end.error:
+                    failed.append(f"{task.name}: {end.error}")
+                    continue
+                known |= {_pair(task.input.key, other): answer for other, answer in end.result.items()}
+                storage.write(ALIKE_NAME, json_text(dict(sorted(known.items()))).encode())
+    return _grouped(mapped, known), failed
 
 
 def _pair(one: str, other: str) -> str:
@@ -142,7 +146,7 @@ def _grouped(mapped: Sequence[Labelled], known: Mapping[str, str]) -> dict[str, 
 
 
 def join_tracks(
-    tracks: Mapping[str, Sequence[Labelled]], storage: Storage, engine: Engine
+    tracks: Mapping[str, Sequence[Labelled]], storage: Storage, engine: Engine, refused_again: bool = False
 ) -> tuple[list[TrackFound], str]:
     """Join the maps of each track that has several, unless that was done before.
 
@@ -150,12 +154,13 @@ def join_tracks(
         tracks: The drives of each track.
         storage: Where results are kept.
         engine: What spreads the work.
+        refused_again: Join maps again that did not fit before.
 
     Returns:
         The tracks, and which disk was full.
     """
     jobs = [_job(name, drives, storage) for name, drives in tracks.items() if len(drives) > 1]
-    failed, disk_full = finish(jobs, TRACKS, join_drives, storage, engine)
+    failed, disk_full = finish(jobs, TRACKS, join_drives, storage, engine, refused_again=refused_again)
     return [_found(job, len(tracks[job.name]), storage, failed.get(job.key, "")) for job in jobs], disk_full
 
 

@@ -22,8 +22,9 @@ from lanenet.reading import parsing, read_json
 #: Sigmas by which a number of two cameras may differ. Chosen: eight numbers of a few pairs of drives exceed
 #: three by chance once in fifty pairs, and a camera that was knocked moves by ten.
 MOST_SIGMAS = 3.5
-#: Least sigma of each number, so that given cameras need not be equal to the last digit.
-_LEAST = {
+#: Numbers that are compared, each with its least sigma, so that given cameras need not be equal to the last
+#: digit. Heights may differ by the share that two lane widths measured with a ruler do, 1.2 % each.
+_NUMBERS = {
     "focal": 1e-3,
     "cx": 0.1,
     "cy": 0.1,
@@ -32,10 +33,10 @@ _LEAST = {
     "roll": 1e-3,
     "yaw": 1e-3,
     "lever": 1e-2,
+    "height": 0.02,
 }
-#: Heights may differ by this share, beyond what the sigmas of focal length and pitch say: two lane widths
-#: measured with a ruler, 1.2 % each.
-_HEIGHT_SIGMA = 0.02
+#: Numbers that have the sigma of another.
+_KNOWN_BY = {"height": "focal"}
 #: Places on the road at which cameras are compared: across and ahead of the front axle, in camera heights.
 _ACROSS, _AHEAD = np.linspace(-1.5, 1.5, 7), np.linspace(0.5, 3.5, 7)
 
@@ -110,8 +111,13 @@ class CameraDifference:
 
 def same_lens(drives: Sequence[DriveCamera]) -> bool:
     """Whether cameras are of one kind, with images of one size."""
-    kinds = {(one.camera.model, one.camera.width, one.camera.height, len(one.camera.D)) for one in drives}
-    return len(kinds) == 1
+    return len(set(map(lens_of, drives))) == 1
+
+
+def lens_of(drive: DriveCamera) -> tuple[str, int, int, int]:
+    """Return the kind of a camera: its model, the size of its images, and how many numbers distort them."""
+    camera = drive.camera
+    return camera.model, camera.width, camera.height, len(camera.D)
 
 
 def difference(first: DriveCamera, second: DriveCamera) -> CameraDifference:
@@ -121,14 +127,18 @@ def difference(first: DriveCamera, second: DriveCamera) -> CameraDifference:
 
 def sigmas_apart(first: DriveCamera, second: DriveCamera) -> dict[str, float]:
     """Return the difference of each number of two cameras, in sigmas of both together."""
-    a, b = (numbers(one.camera) for one in (first, second))
-    sigmas = {}
-    for name, least in _LEAST.items():
-        own = [one.sigma.get(name, 0.0) for one in (first, second)]
-        sigmas[name] = float((b[name] - a[name]) / np.linalg.norm([*own, least]))
-    by_focal = [one.sigma.get("focal", 0.0) for one in (first, second)]
-    sigmas["height"] = float((b["height"] - a["height"]) / np.linalg.norm([*by_focal, _HEIGHT_SIGMA]))
-    return sigmas
+    return dict(zip(_NUMBERS, pairwise_sigmas([first, second])[0, 1].tolist(), strict=True))
+
+
+def pairwise_sigmas(drives: Sequence[DriveCamera]) -> Float[np.ndarray, "n n number"]:
+    """Return the difference of each number between all pairs of cameras (column's less row's), in sigmas."""
+    values = [numbers(one.camera) for one in drives]
+    value = np.array([[own[name] for name in _NUMBERS] for own in values])
+    # A height that follows from the lane's width is as unsure as the focal length that it was found with.
+    sigma = np.array([[one.sigma.get(_KNOWN_BY.get(name, name), 0.0) for name in _NUMBERS] for one in drives])
+    variance = sigma[:, None] ** 2 + sigma[None] ** 2 + np.square(list(_NUMBERS.values()))
+    result: Float[np.ndarray, "n n number"] = (value[None] - value[:, None]) / np.sqrt(variance)
+    return result
 
 
 def numbers(camera: Camera) -> dict[str, float]:

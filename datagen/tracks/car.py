@@ -8,13 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
+from jaxtyping import Bool
 
 from datagen.lanes.scale import measure_lane
 from datagen.slam.camera.coarse import with_known_scale
-from datagen.tracks.cameras import MOST_SIGMAS, DriveCamera, difference, same_lens, sigmas_apart
+from datagen.tracks.cameras import (
+    MOST_SIGMAS,
+    DriveCamera,
+    difference,
+    lens_of,
+    pairwise_sigmas,
+    same_lens,
+)
 from datagen.tracks.shape import Similarity
 from datagen.tracks.together import Together, solve_together
 from datagen.tracks.visit import Visit
@@ -65,31 +72,37 @@ def agreeing_drives(cameras: Sequence[DriveCamera]) -> tuple[list[int], list[Odd
         The places of the agreeing ones, those that know the focal length best first; and the others.
     """
     order = sorted(range(len(cameras)), key=lambda k: (cameras[k].sigma.get("focal", 0.0), k))
-
-    @cache
-    def agree(a: int, b: int) -> bool:
-        return may_be_one(cameras[a], cameras[b])
-
+    agree = _agreement([cameras[k] for k in order])
     best: list[int] = []
-    for first in order:
-        group = [first]
-        for k in order:
-            if k != first and all(agree(min(k, other), max(k, other)) for other in group):
-                group.append(k)
-        if len(group) > len(best):
-            best = sorted(group, key=order.index)
-        if len(best) == len(cameras):
+    for first in range(len(order)):
+        group, left = [first], agree[first].copy()
+        left[first] = False
+        while left.any():
+            nearest = int(left.argmax())
+            group.append(nearest)
+            left &= agree[nearest]
+            left[nearest] = False
+        best = max(best, sorted(group), key=len)
+        if len(best) == len(order):
             break
     odd = []
-    for place in sorted(set(order) - set(best)):
-        than = next(k for k in best if not agree(min(place, k), max(place, k)))
+    for k in set(range(len(order))) - set(best):
+        place, than = order[k], order[next(other for other in best if not agree[k, other])]
         odd.append(Odd(place, than, unlike(cameras[place], cameras[than])))
-    return best, odd
+    return [order[k] for k in best], sorted(odd, key=lambda one: one.place)
+
+
+def _agreement(cameras: Sequence[DriveCamera]) -> Bool[np.ndarray, "n n"]:
+    """Tell for all pairs of cameras whether they may be one."""
+    lenses = [lens_of(one) for one in cameras]
+    same = np.array([[one == other for other in lenses] for one in lenses])
+    near: Bool[np.ndarray, "n n"] = (np.abs(pairwise_sigmas(cameras)) <= MOST_SIGMAS).all(axis=-1)
+    return same & near
 
 
 def may_be_one(one: DriveCamera, other: DriveCamera) -> bool:
-    """Tell whether two cameras may be one; cheap, since all pairs of a car's drives are compared."""
-    return same_lens([one, other]) and max(map(abs, sigmas_apart(one, other).values())) <= MOST_SIGMAS
+    """Tell whether two cameras may be one."""
+    return bool(_agreement([one, other])[0, 1])
 
 
 def unlike(one: DriveCamera, other: DriveCamera) -> str:

@@ -110,7 +110,7 @@ def label_all(
         bool, typer.Option("--pictures", help="Draw the report of each map and the frames of each label set.")
     ] = False,
     refused_again: Annotated[
-        bool, typer.Option("--refused-again", help="Try drives again that were refused before.")
+        bool, typer.Option("--refused-again", help="Try again what was refused before.")
     ] = False,
 ) -> None:
     """Map and label many drives; what is finished is used, and what fails stops nothing.
@@ -203,6 +203,7 @@ def show_result(result: FleetResult, out: str) -> None:
         problems = [joint.reason] if joint.reason else []
         problems += [f"{name} {why}" for name, why in joint.left_out.items()]
         console.show_problems([*problems, *(f"laid anew: {text}" for text in joint.relaid)])
+    console.show_problems([f"could not be compared: {text}" for text in result.uncompared])
     again = "run the command again: what is finished is kept"
     if result.disk_full:
         raise LanenetError(f"{result.disk_full}; {counted(len(left), 'drive')} left; make room, then {again}")

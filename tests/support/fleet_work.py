@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 
 from datagen.fleet.engine import Ended, Task
+from lanenet.errors import LanenetError
 
 
 def double(number: int) -> int:
@@ -83,4 +84,8 @@ class HereEngine:
     def run(self, work: Callable[[Any], Any], tasks: Sequence[Task]) -> Generator[Ended, None, None]:
         for number, task in enumerate(tasks):
             self.names.append(task.name)
-            yield Ended(number, work(task.input))
+            try:
+                ended = Ended(number, work(task.input))
+            except LanenetError as error:
+                ended = Ended(number, error=str(error))
+            yield ended

@@ -99,6 +99,33 @@ def test_maps_that_are_not_joined_are_an_answer(tiny: Path, tmp_path: Path, join
     assert run(tmp_path / "out", drives)[1] == []
 
 
+def test_maps_that_did_not_fit_are_joined_again_if_that_is_asked_for(
+    tiny: Path, tmp_path: Path, joining: list[list[str]]
+):
+    drives = on("hall", tiny, tmp_path, "a", "elsewhere")
+    run(tmp_path / "out", drives)
+    assert run(tmp_path / "out", drives, refused_again=True)[1] == ["hall"]
+    assert joining == [["a", "elsewhere"]] * 2
+
+
+def test_maps_that_could_not_be_compared_are_named_and_compared_in_the_next_run(
+    tiny: Path, tmp_path: Path, joining: list[list[str]], monkeypatch: pytest.MonkeyPatch
+):
+    def broken(folder: Path) -> str:
+        raise LanenetError(f"{folder.name}: cannot be read")
+
+    drives = on("", tiny, tmp_path, "a", "b", "c")
+    with monkeypatch.context() as patch:
+        patch.setattr(tracks, "read_shape", broken)
+        result, _ = run(tmp_path / "out", drives, find_tracks=True)
+    assert [text.partition(":")[0] for text in result.uncompared] == ["track of b", "track of c"]
+    assert "ould not be compared: track of b" in (tmp_path / "out" / "index.html").read_text()
+    monkeypatch.setattr(tracks, "read_shape", lambda folder: "")
+    monkeypatch.setattr(tracks, "recognise", lambda one, other: Recognised("same", ""))
+    result, _ = run(tmp_path / "out", drives, find_tracks=True)
+    assert result.uncompared == () and result.tracks[0].joined == ("a", "b", "c")
+
+
 def test_a_join_that_the_disk_has_no_room_for_is_tried_again(
     tiny: Path, tmp_path: Path, joining: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ):
