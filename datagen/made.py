@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lanenet.config import Settings
+from lanenet.data.drives import meant_instead
 from lanenet.data.files import write_json
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.outputs import lock_output
@@ -35,7 +36,7 @@ def fingerprint(path: Path) -> str:
         DriveFormatError: If the recording does not exist.
     """
     if not path.exists():
-        raise DriveFormatError(f"{path}: no such drive")
+        raise DriveFormatError(f"{path}: no such drive{meant_instead(path)}")
     files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.is_file())
     return key_of(*((p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files))
 

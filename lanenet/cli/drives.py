@@ -243,7 +243,7 @@ def _drives_of(library: Library, sources: list[Path]) -> list[Path]:
     Raises:
         LanenetError: If a path is no drive and holds none.
     """
-    from lanenet.data.drives import drives_in, find_format, formats_text
+    from lanenet.data.drives import drives_in, find_format, formats_text, meant_instead
 
     found: list[Path] = []
     for source in sources:
@@ -252,8 +252,11 @@ def _drives_of(library: Library, sources: list[Path]) -> list[Path]:
         inside = [path for path in inside if not path.resolve().is_relative_to(library.copies)]
         inside = [path for path in inside if not (path.parent / "map.yaml").is_file()]
         if not inside:
-            what = "no drive, and holds none" if source.exists() else "no such drive or folder"
-            raise ConfigError(f"{source}: {what}; expected {formats_text()}, or a folder of them")
+            if not source.exists():
+                raise ConfigError(f"{source}: no such drive or folder{meant_instead(source)}")
+            raise ConfigError(
+                f"{source}: no drive, and holds none; expected {formats_text()}, or a folder of them"
+            )
         found += inside
     return list(dict.fromkeys(found))
 

@@ -27,6 +27,8 @@ from lanenet.viewers.viewer import ViewerKind
 
 #: The map is repeated, so that who comes late to a replay gets it, too. Chosen.
 _MAP_EVERY_S = 5.0
+#: Who wrote a file, in its header.
+_LIBRARY = "lanenet"
 #: The times of ROS 2 have seconds of 32 bits; one year of them is left for the drive.
 _LAST_S = 2.0**31 - 3.2e7
 #: Marker.msg: types and actions.
@@ -55,7 +57,7 @@ class McapFile:
         writer = require("mcap.writer", "viewers")
         self._file = Path(path).open("wb")  # noqa: SIM115 - closed by close()
         self._writer = writer.Writer(self._file)
-        self._writer.start(profile="ros2", library="lanenet")
+        self._writer.start(profile="ros2", library=_LIBRARY)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
@@ -263,10 +265,22 @@ def _rgba(bgr: Bgr) -> dict[str, float]:
     return {"r": r, "g": g, "b": b, "a": 1.0}
 
 
+def is_own(path: Path) -> bool:
+    """Tell whether an MCAP file was written here; what cannot be read was not."""
+    try:
+        with path.open("rb") as file:
+            # Magic bytes, then the header: its kind and length, profile and library (each with its length).
+            start = file.read(8 + 9 + 4 + len("ros2") + 4 + len(_LIBRARY))
+    except OSError:
+        return False
+    return start.startswith(b"\x89MCAP") and start.endswith(_LIBRARY.encode())
+
+
 KIND = ViewerKind(
     "mcap",
     McapFile,
     check=lambda: require("mcap", "viewers"),
     ending=".mcap",
     help="Write what is seen as ROS 2 messages, for Foxglove and ROS 2.",
+    to_look="open {file} in Foxglove",
 )

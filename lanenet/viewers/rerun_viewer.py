@@ -227,5 +227,6 @@ KIND = ViewerKind(
     ending=".rrd",
     help=f"Show what is seen in Rerun: a file to write, '{_LIVE}' for a viewer that opens here, or the "
     "address of one that runs.",
+    to_look="rerun {file}",
     addresses=(_LIVE, _ADDRESS),
 )

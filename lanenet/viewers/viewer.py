@@ -35,8 +35,9 @@ class ViewerKind:
         open: Opens a file to write, or an address; called with one of them.
         check: Raises MissingExtraError if its package is not installed.
         ending: Of its files.
-        addresses: What targets begin with that are no files.
         help: Of its option.
+        to_look: How a person looks at a file of its, with ``{file}`` for the file.
+        addresses: What targets begin with that are no files.
     """
 
     name: str
@@ -44,6 +45,7 @@ class ViewerKind:
     check: Callable[[], object]
     ending: str
     help: str
+    to_look: str
     addresses: tuple[str, ...] = ()
 
     @property

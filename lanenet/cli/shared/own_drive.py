@@ -123,7 +123,7 @@ def sources_in(path: Path) -> list[Path]:
         DriveFormatError: If it is none of these.
     """
     if not path.exists():
-        raise DriveFormatError(f"{path}: no such drive, map, label set or config")
+        raise DriveFormatError(f"{path}: no such drive, map, label set or config{meant_instead(path)}")
     if _is_source(path):
         return [path]
     inside = [each for each in sorted(path.iterdir()) if _is_source(each)] if path.is_dir() else []

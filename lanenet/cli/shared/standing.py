@@ -13,6 +13,7 @@ from lanenet.config import read_yaml
 from lanenet.data.drives import find_format
 from lanenet.errors import LanenetError
 from lanenet.outputs import restore_output
+from lanenet.viewers.mcap_file import is_own
 
 #: Folders deep that are looked into, and how many in all. Chosen: ``mycar/data/tub_1`` is found from the one
 #: above ``mycar``, and a home folder takes about a second.
@@ -49,7 +50,7 @@ def look_around(folder: Path) -> Standing:
         files = [entry for entry in entries if not entry.is_dir()]
         labels += [file for file in files if file.suffix == ".parquet" and file.with_suffix(".json") in files]
         if path == folder:
-            drives += [file for file in files if find_format(file) is not None]
+            drives += [file for file in files if find_format(file) is not None and not is_own(file)]
         if path / "map.yaml" in files:
             meta = _content(path / "map.yaml")
             rejected = meta.get("verdict") not in ("good", "usable")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import shlex
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -96,7 +97,12 @@ def with_viewers(verb: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(verb)
     def run(**given: Any) -> None:
         targets = {name: given.pop(name) for name in VIEWERS}
-        verb(**given, views=Views({name: target for name, target in targets.items() if target is not None}))
+        views = Views({name: target for name, target in targets.items() if target is not None})
+        verb(**given, views=views)
+        for name, target in views.targets.items():
+            # A command that makes several recordings adds to the name.
+            if VIEWERS[name].is_file(target) and Path(target).is_file():
+                console.say("to look at it: " + VIEWERS[name].to_look.format(file=shlex.quote(target)))
 
     kept = [
         parameter.replace(annotation=hints[name])

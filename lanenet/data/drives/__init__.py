@@ -5,6 +5,7 @@ A format is a module with a :class:`DriveFormat`, and one entry in :data:`FORMAT
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import shlex
 from collections.abc import Iterator
@@ -47,7 +48,7 @@ def open_drive(path: Path) -> Drive:
     path = Path(path)
     restore_output(path)
     if not path.exists():
-        raise DriveFormatError(f"{path}: no such drive")
+        raise DriveFormatError(f"{path}: no such drive{meant_instead(path)}")
     found = find_format(path)
     if found is None:
         raise DriveFormatError(f"{path}: not a drive: expected {formats_text()}{meant_instead(path)}")
@@ -55,7 +56,12 @@ def open_drive(path: Path) -> Drive:
 
 
 def meant_instead(path: Path) -> str:
-    """Name the drive that a path that is none belongs to, or those in it; the end of a sentence."""
+    """Name the drive that a path that is none belongs to, or those in it; the end of a sentence.
+
+    For a path that leads nowhere it is the one beside it with the most similar name, whatever that is.
+    """
+    if not path.exists():
+        return _spelt_instead(path)
     if tub.is_old(path):
         return "; a version 1 tub has to be converted by Donkeycar first"
     if path.suffix == ".bag":
@@ -69,6 +75,15 @@ def meant_instead(path: Path) -> str:
     names = ", ".join(shlex.quote(str(each)) for each in inside[:_HINT_COUNT])
     more = " or another" if len(inside) > _HINT_COUNT else ""
     return f"; {'there is a drive' if len(inside) == 1 else 'there are drives'} in it: type {names}{more}"
+
+
+def _spelt_instead(path: Path) -> str:
+    try:
+        beside = [entry.name for entry in path.parent.iterdir()]
+    except OSError:  # neither is there a folder
+        return ""
+    alike = difflib.get_close_matches(path.name, beside, n=1)
+    return f"; did you mean {shlex.quote(str(path.with_name(alike[0])))}?" if alike else ""
 
 
 def drive_above(path: Path) -> Path | None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from lanenet.cli.app import app
 from lanenet.cli.shared.standing import look_around
 from lanenet.data.drives import find_format
+from lanenet.viewers.mcap_file import McapFile
 
 
 @pytest.fixture
@@ -77,11 +78,12 @@ def test_what_is_damaged_hidden_or_part_of_something_is_no_drive(here: Path) -> 
     (here / "runs").mkdir()
     for folder in ("runs", "."):
         (here / folder / "clip.mp4").touch()
+    McapFile("seen.mcap").close()
     (here / "broken").mkdir()
     (here / "broken" / "map.yaml").write_text("[")
     found = look_around(Path())
     # An annotated video of a run is no drive.
-    assert found.drives == (Path("clip.mp4"), Path("lap"))
+    assert find_format(Path("seen.mcap")) and found.drives == (Path("clip.mp4"), Path("lap"))
     assert list(found.refused) == [Path("broken")] and not found.maps and not found.label_sets
 
 

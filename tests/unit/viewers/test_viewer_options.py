@@ -16,6 +16,7 @@ from watched import mapped_drive
 from lanenet.cli.app import app
 from lanenet.cli.map import view_map
 from lanenet.cli.shared.viewing import Views
+from lanenet.viewers.mcap_file import is_own
 from lanenet.viewers.registry import VIEWERS
 
 
@@ -55,6 +56,9 @@ def test_detect_shows_a_drive_on_the_map_that_gave_its_camera(folder: Path, tmp_
     result = run(*words, "--camera", folder / "map", *out)
     assert result.exit_code == 0, result.output
     assert f"wrote {tmp_path / 'l.rrd'}" in result.output and f"wrote {tmp_path / 'l.mcap'}" in result.output
+    assert f"rerun {tmp_path / 'l.rrd'}" in result.output and "l.mcap in Foxglove" in result.output
+    # It could be read as a drive, but nobody recorded it.
+    assert is_own(tmp_path / "l.mcap") and not is_own(tmp_path / "l.rrd") and not is_own(tmp_path / "none")
     found = counts(tmp_path / "l.mcap")
     assert {found[t] for t in ("/pose", "/lane/detected", "/lane/reference", "/confidence", "/edges")} == {10}
     # With the camera alone there is no map.
