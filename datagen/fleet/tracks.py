@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from datagen.fleet.engine import Engine, Task
 from datagen.fleet.meter import Meter
 from datagen.fleet.result import Labelled, TrackFound
@@ -29,7 +27,7 @@ from lanenet.errors import LanenetError, TrackingLostError
 
 #: Which maps are of one track, beside the results.
 ALIKE_NAME = "alike.json"
-#: So many maps of a track are joined at most, evenly chosen: all frames are adjusted together. Chosen: ten
+#: So many maps of a track are joined at most: all frames are adjusted together. Chosen: ten
 #: minutes of driving or so.
 _MOST_JOINED = 12
 #: What the shapes of two maps take while they are compared, [bytes]. Chosen: ten times the edge points of a
@@ -159,15 +157,16 @@ def join_tracks(
     Returns:
         The tracks, and which disk was full.
     """
-    jobs = [_job(name, drives, storage) for name, drives in tracks.items() if len(drives) > 1]
+    jobs = [track_job(name, drives, storage) for name, drives in tracks.items() if len(drives) > 1]
     failed, disk_full = finish(jobs, TRACKS, join_drives, storage, engine, refused_again=refused_again)
     return [_found(job, len(tracks[job.name]), storage, failed.get(job.key, "")) for job in jobs], disk_full
 
 
-def _job(name: str, drives: Sequence[Labelled], storage: Storage) -> SeveralJob:
+def track_job(name: str, drives: Sequence[Labelled], storage: Storage) -> SeveralJob:
     """Choose the maps that are joined; their order, and so the frame of the track, is that of the drives."""
-    places = np.unique(np.linspace(0, len(drives) - 1, min(len(drives), _MOST_JOINED)).astype(int))
-    chosen = tuple((drives[k].drive, drives[k].map_key) for k in places)
+    # Keys are as good as drawn at random, and of the drives that a track gets later few change the choice.
+    least = set(sorted(drive.map_key for drive in drives)[:_MOST_JOINED])
+    chosen = tuple((drive.drive, drive.map_key) for drive in drives if drive.map_key in least)
     key = key_of(TRACKS, [(drive.name, map_key) for drive, map_key in chosen])
     return SeveralJob(name, chosen, storage.url, key, version())
 

@@ -14,8 +14,10 @@ import pytest
 from fleet_runs import copy_of, drives_of, run
 
 from datagen.fleet import tracks
+from datagen.fleet.result import Labelled
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import FleetDrive
+from datagen.made import key_of
 from datagen.quality.figures import Report
 from datagen.tracks.recognise import Recognised
 from lanenet.data.maps.joined import FORMAT, JoinedDrive, JoinedMeta, maps_in, read_joined, write_joined
@@ -89,6 +91,20 @@ def test_a_new_drive_of_a_track_joins_that_track_again_and_labels_nothing_else(
     _, names = run(tmp_path / "out", [*hall, *yard, *on("hall", tiny, tmp_path, "c")])
     assert names == ["c", "hall"]
     assert run(tmp_path / "out", hall + yard, each_alone=True)[0].tracks == ()
+
+
+def test_of_the_drives_that_a_long_driven_track_gets_few_join_it_anew(tmp_path: Path):
+    storage = Storage(str(tmp_path))
+    drives = [
+        Labelled(FleetDrive(f"lap {k}", "tub", str(k), 40.0), "good", "", True, key_of(k), "")
+        for k in range(100)
+    ]
+    jobs = [tracks.track_job("hall", drives[:count], storage) for count in range(2, 101)]
+    assert max(len(job.drives) for job in jobs) == 12
+    # Expected of keys at random: 11 to the twelfth drive, and 12 (1/13 + ... + 1/100), 25, after it.
+    assert len({job.key for job in jobs}) < 50
+    names = [drive.name for drive, _ in jobs[-1].drives]
+    assert names == [drive.drive.name for drive in drives if drive.drive.name in names]
 
 
 def test_maps_that_are_not_joined_are_an_answer(tiny: Path, tmp_path: Path, joining: list[list[str]]):
