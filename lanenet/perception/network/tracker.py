@@ -20,6 +20,7 @@ from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import SURE, LaneMemory
 from lanenet.perception.network import compiled
 from lanenet.perception.network.lane_belief import Keep, LineLooks
+from lanenet.perception.network.line_ahead import lie_too_near
 from lanenet.perception.network.refinement import BASIS, RefinedLines, RoadBorders, line_at, refine_lines
 from lanenet.perception.network.straight_on import SeenLines, StraightOn
 from lanenet.perception.rolling_median import RollingMedian
@@ -194,6 +195,8 @@ class LaneTracker:
         told = np.array([1.0 if line.seen_cm >= _LINE_SEEN_CM else 0.0 for line in pair])
         found_cm, found_sigma_cm = self.lane.complete(found_cm, found_sigma_cm, told)
         self._last = _both(found_cm), _both(found_sigma_cm)
+        if told[0] != told[1]:
+            self._doubt_told(pair, int(told[1]), found_cm, found_sigma_cm, edges)
         if (doubts := self.straight_on.doubts(found_cm, self.lane.width_cm)) is not None:
             found_sigma_cm[doubts] = np.inf
         for side, line in enumerate(pair):
@@ -204,6 +207,24 @@ class LaneTracker:
             found_sigma_cm[:] = np.inf
         known = self._known(found_cm, found_sigma_cm, points_cm)
         return (*known, np.array([left.seen_cm, right.seen_cm]))
+
+    def _doubt_told(
+        self,
+        pair: tuple[_Candidate, _Candidate],
+        side: int,
+        found_cm: Float[np.ndarray, "6"],
+        found_sigma_cm: Float[np.ndarray, "6"],
+        edges: RoadEdges,
+    ) -> None:
+        """Where only the line of one side is seen, and turns ahead, the other one has turned before."""
+        if not pair[side].seen_at[-1]:
+            return
+        other = slice(len(ROWS_CM) * (1 - side), len(ROWS_CM) * (2 - side))
+        widths_cm = self._markings_cm[side]
+        marking_cm = widths_cm.median if len(widths_cm) >= _ENOUGH else _MARKING_CM
+        seen_cm = np.array(pair[side].points_cm)
+        near = lie_too_near(found_cm[other], seen_cm, side, marking_cm, self.lane.likely_cm, edges)
+        found_sigma_cm[other][near] = np.inf
 
     def _recall_near(
         self,
