@@ -80,7 +80,7 @@ def line_beside(line: SeenLine, width_cm: float, edges: RoadEdges) -> Float[np.n
 
 
 def _followed(line: SeenLine, width_cm: float, edges: RoadEdges) -> list[tuple[float, float]]:
-    """Follow a line from the last label row on for a lane's width, by its border on the lane's side.
+    """Follow a line from the last label row on, for a lane's width, by its border on the lane's side.
 
     Returns:
         x and y of its middle, [cm], frame car; none where no border is found.

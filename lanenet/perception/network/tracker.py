@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from lanenet.geometry.lane import N_POINTS, ROWS_CM, SIDES, parallel_points
 from lanenet.perception.edges.road import RoadEdges
-from lanenet.perception.estimate import SURE, LaneMemory
+from lanenet.perception.estimate import SEEN, SURE, LaneMemory
 from lanenet.perception.network import compiled
 from lanenet.perception.network.lane_belief import Keep, LineLooks
 from lanenet.perception.network.line_beside import SeenLine, line_beside
@@ -64,9 +64,9 @@ _BEYOND_SEEN_CM = 26.0
 _NARROWEST = 0.3
 _MIDDLE = 1
 #: Length along the road in which both lines have to be seen to tell the lane's width, as lines that the
-#: network is sure of: the rim of a reflection that is found again in each frame tells none. On 120 simulated
-#: drives without a given width the RMSE is 2.55 instead of 3.60 cm for it. Tried: 9, 15 and 21 cm gave 2.58,
-#: 2.55 and 2.28, and 94.8, 94.1 and 92.9 % of the points are answered.
+#: network sees, too: the rim of a reflection that is found again in each frame tells none. On 120 simulated
+#: drives without a given width the RMSE is 2.54 instead of 3.60 cm for it. Tried: 9, 15 and 21 cm gave 2.58,
+#: 2.55 and 2.28 cm, and 94.8, 94.1 and 92.9 % of the points are answered.
 _TELLS_WIDTH_CM = 15.0
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
 #: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
@@ -488,7 +488,7 @@ class LaneTracker:
         best = scores.index(max(scores))
         shown = pairs[best]
         # A belief must not choose its own evidence: else a wrong one would never be unlearned.
-        plain = all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SURE for line in shown)
+        plain = all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SEEN for line in shown)
         if outsides[best] <= 0.0 and plain:
             self.lane.learn(np.array(shown[0].points_cm + shown[1].points_cm), _CERTAIN)
         scores = [score - _BY_WIDTH_CM * (1.0 - own) for score, own in zip(scores, likely, strict=True)]
