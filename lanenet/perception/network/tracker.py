@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.geometry.lane import N_POINTS, ROWS_CM, SIDES, parallel_points
+from lanenet.geometry.lane import ROWS_CM, SIDES, parallel_points
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import SEEN, SURE, LaneMemory
 from lanenet.perception.network import compiled
