@@ -157,9 +157,12 @@ def test_a_line_that_nothing_tells_of_is_not_answered():
 
 
 @pytest.mark.parametrize(
-    ("x_cm", "sides", "answered"), [(0.5, (1,), False), (9.0, (1,), True), (0.5, (0, 1), True)]
+    ("x_cm", "sides", "answered"),
+    [(0.9, (1,), False), (9.0, (1,), True), (0.9, (0, 1), True), (0.5, (0, 1), False)],
 )
-def test_a_car_on_a_line_that_alone_is_seen_is_in_a_lane_that_nobody_knows(x_cm, sides, answered):
+def test_a_car_on_a_line_is_in_a_lane_that_nobody_knows_within_sigma_if_that_alone_is_seen(
+    x_cm, sides, answered
+):
     tracker = LaneTracker(LaneMemory(LANE_CM))
     lines = np.repeat([x_cm - LANE_CM, x_cm], 3)
     for _ in range(3):
@@ -169,10 +172,10 @@ def test_a_car_on_a_line_that_alone_is_seen_is_in_a_lane_that_nobody_knows(x_cm,
 
 def test_two_lanes_for_which_equally_much_speaks_are_none():
     tracker = LaneTracker(LaneMemory(LANE_CM))
-    lines = np.repeat([0.5 - LANE_CM, 0.5, 0.5 + LANE_CM], 3)
+    lines = np.repeat([0.9 - LANE_CM, 0.9, 0.9 + LANE_CM], 3)
     tracker.follow(lines[:6], SURE, SEEN, edges_of(lines[:6]))
     # The car has come onto a line: the network takes the next lane, half sure.
-    lines -= 0.6
+    lines -= 1.8
     both = edges_of(lines[:6]).rows(), edges_of(lines[3:], sides=(1,)).rows()
     edges = RoadEdges.of_rows(np.concatenate(both))
     points_cm, _, _ = tracker.follow(lines[3:], SURE, 0.5 * SEEN, edges)
@@ -272,6 +275,15 @@ def test_a_width_that_was_learned_wrong_is_unlearned_though_it_speaks_against_th
     for _ in range(150):
         tracker.follow(BENT, SURE, SEEN, edges_of(BENT))
     assert lane.width_cm == pytest.approx(LANE_CM, rel=0.04)
+
+
+def test_a_line_that_the_network_does_not_see_tells_nothing_of_the_lanes_width():
+    for presence, known in ((1.0, True), (0.2, False)):
+        lane = LaneMemory()
+        tracker = LaneTracker(lane)
+        for _ in range(20):
+            tracker.follow(BENT, SURE, np.array([1.0, presence]), edges_of(BENT))
+        assert (lane.width_cm is not None) == known
 
 
 def test_a_pair_beside_the_car_tells_nothing_of_the_lanes_width():

@@ -51,6 +51,8 @@ def model_path(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.onnx"
     network = new_network(NetworkSettings(channels=(4, 8), hidden=8, bins=0), 24, 32, 0).eval()
     network.mean_cm.copy_(torch.from_numpy(LANE))
+    # Untrained, it is half sure of each line.
+    network.lower_presence(-1.0)
     raster = np.where(np.random.default_rng(0).random((2, 5, 24, 32)) < 0.1, 255, 0).astype(np.uint8)
     export_onnx(network, META, raster, path)
     return path
