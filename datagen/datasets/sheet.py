@@ -269,13 +269,13 @@ def _mapped(drive_map: DriveMap) -> Sheet:
 
 
 def _told(recording: RecordedSettings, source: Path) -> Sheet:
-    """What people said of a drive: in the library of this folder, the config, or its own ``drive.yaml``."""
+    """What people said of a drive: in the run's config or library, that of this folder, or ``drive.yaml``."""
     told: Sheet = {key: getattr(recording, key) or None for key in ("licence", "car", "track")}
     # A sheet comes at the end of a long training, which a damaged file of these must not spoil.
     with contextlib.suppress(LanenetError):
-        told["licence"] = told["licence"] or read_drive_file(source)[0].licence or None
-    with contextlib.suppress(LanenetError):
         entry = Library.open(DEFAULT_LIBRARY).find(source) if DEFAULT_LIBRARY.is_file() else None
         if entry is not None:
-            told = {key: getattr(entry, key) or told[key] for key in told}
+            told = {key: told[key] or getattr(entry, key) or None for key in told}
+    with contextlib.suppress(LanenetError):
+        told["licence"] = told["licence"] or read_drive_file(source)[0].licence or None
     return told

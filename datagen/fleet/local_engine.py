@@ -63,8 +63,15 @@ class LocalEngine:
         try:
             while waiting or running:
                 while waiting and idle and self._has_room(tasks, running.values(), waiting[0]):
-                    worker, number = idle.pop(), waiting.popleft()
-                    running[worker.submit(work, tasks[number])] = (worker, number)
+                    worker, number = idle.pop(), waiting[0]
+                    try:
+                        future = worker.submit(work, tasks[number])
+                    except BrokenProcessPool:  # it was killed while it waited, which says nothing of the task
+                        worker.end()
+                        idle.append(_Worker())
+                        continue
+                    waiting.popleft()
+                    running[future] = (worker, number)
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     worker, number = running.pop(future)
                     idle.append(worker)

@@ -58,7 +58,7 @@ def finish(
         Why jobs failed, by the keys of their results, and which disk was full.
     """
     if refused_again:
-        results = storage.results(kind, [job.key for job in jobs])
+        results = storage.results(kind, storage.finished(kind).intersection(job.key for job in jobs))
         storage.sweep(kind, [key for key, result in results.items() if result["verdict"] == REFUSED])
     missing = [job for job in jobs if storage.result(kind, job.key) is None]
     failed, disk_full = dict[str, str](), ""

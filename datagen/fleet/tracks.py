@@ -85,20 +85,25 @@ def recognised_tracks(
                 if end.error:
                     failed.append(f"{task.name}: {end.error}")
                     continue
-                known |= {_pair(task.input.key, other): answer for other, answer in end.result.items()}
+                answers, unreadable = end.result
+                known |= {_pair(task.input.key, other): answer for other, answer in answers.items()}
+                failed += unreadable
                 storage.write(ALIKE_NAME, json_text(dict(sorted(known.items()))).encode())
-    return _grouped(mapped, known), failed
+    return _grouped(mapped, known), list(dict.fromkeys(failed))
 
 
 def _pair(one: str, other: str) -> str:
     return " ".join(sorted((one, other)))
 
 
-def compare_maps(job: AlikeJob) -> dict[str, str]:
+def compare_maps(job: AlikeJob) -> tuple[dict[str, str], list[str]]:
     """Say whether a map is of the track of others, by their keys; a function of a module.
 
+    Returns:
+        The answers; and why others could not be read.
+
     Raises:
-        LanenetError: If a map cannot be read.
+        LanenetError: If the map cannot be read.
     """
     if job.made_by != version():
         raise LanenetError(f"found {version()}, the run needs {job.made_by}")
@@ -108,8 +113,13 @@ def compare_maps(job: AlikeJob) -> dict[str, str]:
         with storage.fetched(MAPS, key) as folder:
             return read_shape(folder)
 
-    own = shape(job.key)
-    return {other: recognise(own, shape(other)).answer for other in job.others}
+    own, answers, unreadable = shape(job.key), dict[str, str](), list[str]()
+    for other in job.others:
+        try:
+            answers[other] = recognise(own, shape(other)).answer
+        except (LanenetError, OSError) as error:
+            unreadable.append(f"the map {other}: {error}")
+    return answers, unreadable
 
 
 def _grouped(mapped: Sequence[Labelled], known: Mapping[str, str]) -> dict[str, list[Labelled]]:

@@ -18,7 +18,7 @@ import yaml
 from jaxtyping import Float, UInt8
 
 from datagen.fleet.meter import Meter
-from datagen.fleet.source import on_this_machine
+from datagen.fleet.source import checksum, on_this_machine
 from datagen.fleet.storage import RESULT_NAME, Storage, local_path
 from datagen.fleet.task import LABELS, MAPS, FleetDrive, FleetSettings
 from datagen.made import key_of
@@ -122,6 +122,7 @@ def _label_drive(job: Job) -> Outcome:
         if mapped is None:
             with storage.new(MAPS, map_key) as folder:
                 mapped = _map(job, path, folder)
+                _check_unchanged(drive, path)
         if mapped["verdict"] in (REJECTED, REFUSED):
             return Outcome(mapped["verdict"], mapped["reason"])
         if not job.labels:
@@ -130,7 +131,14 @@ def _label_drive(job: Job) -> Outcome:
         if labelled is None:
             with storage.fetched(MAPS, map_key) as map_folder, storage.new(LABELS, labels_key) as folder:
                 labelled = _label(job, path, map_folder, folder)
+                _check_unchanged(drive, path)
     return Outcome(labelled["verdict"] or mapped["verdict"], labelled["reason"])
+
+
+def _check_unchanged(drive: FleetDrive, path: Path) -> None:
+    """Refuse to keep what was made from other files than the key says, as of a drive that is being copied."""
+    if checksum(str(path)) != drive.checksum:
+        raise LanenetError(f"{drive.source}: its files have changed since the run began")
 
 
 def _map(job: Job, path: Path, folder: Path) -> dict[str, Any]:

@@ -232,7 +232,14 @@ def _joined_by_torchrun() -> Iterator[Processes]:
     )
     uses_gpu = torch.cuda.is_available() and torch.cuda.device_count() >= local_size
     try:
-        store = _store_of_this_start() if local_size == size and _torchrun_keeps_a_store() else None
+        store = None
+        if _torchrun_keeps_a_store():
+            if local_size != size:
+                raise ConfigError(
+                    "torchrun on several machines keeps the addresses of processes that have ended, and may "
+                    "wait for one of them after a restart: set TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1 on all"
+                )
+            store = _store_of_this_start()
         with _joined(store, rank, size, uses_gpu, local_rank) as processes:
             yield processes
     except LostProcessError:
@@ -246,7 +253,7 @@ def _store_of_this_start() -> Store:
     """Return a store that processes of an earlier start did not write to.
 
     torchrun keeps one store for all starts, where a process that is started again may find the address of
-    one that has ended. On several machines the counts of starts can differ, so they cannot tell starts apart.
+    one that has ended. On one machine; on several, their counts of starts may differ.
     """
     with _noticing():
         store = TCPStore(

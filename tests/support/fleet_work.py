@@ -75,6 +75,10 @@ def together(job: tuple[Path, str]) -> int:
     return most
 
 
+def pid_of_worker(_: object) -> int:
+    return os.getpid()
+
+
 class HereEngine:
     """Runs tasks in this process, one after the other."""
 

@@ -158,17 +158,22 @@ def _inside(frames: Int[np.ndarray, "n"], run: Overlap) -> Bool[np.ndarray, "n"]
 
 
 def _same_images(one: Fingerprint, other: Fingerprint) -> list[Overlap]:
-    """Find runs of images with the same bytes, in the same order; frames may be missing in either."""
+    """Find runs of images with the same bytes, in the same order; frames may be missing in either.
+
+    Images that are the same in another order are one more run, from the first of them to the last.
+    """
     _, rows, others = np.intersect1d(one.digests, other.digests, return_indices=True)
     rows, others = rows[one.digests[rows] != 0], others[one.digests[rows] != 0]
     order = np.argsort(rows)
     rows, others = rows[order], others[order]
     cuts = np.flatnonzero(np.diff(others) < 0) + 1
-    return [
-        Overlap(_ends(one, i), _ends(other, j), len(i), True, 0.0)
-        for i, j in zip(np.split(rows, cuts), np.split(others, cuts), strict=True)
-        if len(i) >= _LEAST_SAME
-    ]
+    pieces = list(zip(np.split(rows, cuts), np.split(others, cuts), strict=True))
+    runs = [(i, j) for i, j in pieces if len(i) >= _LEAST_SAME]
+    short = [(i, j) for i, j in pieces if len(i) < _LEAST_SAME]
+    if short and sum(len(i) for i, _ in short) >= _LEAST_SAME:
+        i, j = (np.sort(np.concatenate(parts)) for parts in zip(*short, strict=True))
+        runs = sorted([*runs, (i, j)], key=lambda run: int(run[0][0]))
+    return [Overlap(_ends(one, i), _ends(other, j), len(i), True, 0.0) for i, j in runs]
 
 
 def _ends(fingerprint: Fingerprint, rows: Int[np.ndarray, "k"]) -> tuple[int, int]:

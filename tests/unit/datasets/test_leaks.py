@@ -205,7 +205,10 @@ def test_what_was_compared_is_not_compared_again(
 @pytest.mark.parametrize("splits", [("train", "test"), ("time", "time"), ("train", "lap")])
 def test_drives_of_one_track_in_different_parts_are_refused(tmp_path: Path, splits: tuple[str, str]) -> None:
     run = _run(
-        *({"path": tmp_path / f"{k}", "track": "hall", "split": split} for k, split in enumerate(splits))
+        *(
+            {"path": tmp_path / f"{k}", "track": track, "split": split}
+            for k, (track, split) in enumerate(zip(("hall", "Hall "), splits, strict=True))
+        )
     )
     with pytest.raises(ConfigError, match="are both of the track 'hall'"):
         check_leaks(run, tmp_path / "work")

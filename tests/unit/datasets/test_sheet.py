@@ -145,6 +145,9 @@ def test_a_recorded_drive_has_its_licence_from_the_library_and_the_rest_from_map
     assert library.find(folder) is None
     (entry,) = sheet()["recorded"]
     assert (entry["licence"], entry["car"], entry["track"]) == ("CC0-1.0", "red", "garage")
+    # The run's own library says more than that of the folder it was started in.
+    (entry,) = data_sheet("net", data, prepared, tmp_path, [said])["recorded"]
+    assert {key: entry[key] for key in told} == told
     # What people say in the library counts; a library that is damaged does not spoil the sheet.
     library.update("tub", licence="CC-BY-4.0")
     assert sheet()["recorded"][0]["licence"] == "CC-BY-4.0"

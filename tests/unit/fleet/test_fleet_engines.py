@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from pathlib import Path
 
 import pytest
-from fleet_work import die_or_wait, die_times, double, fail, is_alive, threads, together
+from fleet_work import die_or_wait, die_times, double, fail, is_alive, pid_of_worker, threads, together
 
 from datagen.fleet.engine import MAX_RETRIES, Ended, Task
 from datagen.fleet.local_engine import LocalEngine
@@ -46,6 +47,14 @@ def test_a_task_that_kills_each_of_its_workers_fails_and_others_go_on(tmp_path: 
     bad, good = by_number(list(LocalEngine(1).run(die_times, tasks)))
     assert f"killed {MAX_RETRIES + 1} times" in bad.error and "--workers" in bad.error
     assert good == Ended(1, "done")
+
+
+def test_a_worker_that_is_killed_while_it_waits_is_replaced_and_no_task_fails():
+    running = LocalEngine(2, memory_bytes=1).run(pid_of_worker, tasks_of(*range(4)))
+    first = next(running)
+    # Only one task runs at a time, the worker that did the first may wait now.
+    os.kill(first.result, signal.SIGKILL)
+    assert [each.error for each in running] == [""] * 3
 
 
 def test_a_worker_computes_in_one_thread(monkeypatch: pytest.MonkeyPatch):

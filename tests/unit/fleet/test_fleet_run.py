@@ -203,6 +203,20 @@ def test_a_drive_that_is_not_on_the_worker_has_failed_and_is_not_refused(tiny: P
     )
 
 
+def test_a_drive_that_changes_in_the_run_has_failed_and_nothing_of_it_is_kept(tiny: Path, tmp_path: Path):
+    storage = Storage(str(tmp_path / "out"))
+    drive = copy_of(tiny, tmp_path / "tub")
+    checked = with_checksums(drives_of(drive), storage)
+    whole = (drive / "frames.csv").read_bytes()
+    for other in (b"junk", whole + b"\n"):
+        (drive / "frames.csv").write_bytes(other)
+        (found,) = label_all(checked, SETTINGS, storage, HereEngine()).drives
+        assert found.verdict == "failed" and "tub: its files have changed since the run began" in found.reason
+    (drive / "frames.csv").write_bytes(whole)
+    (found,) = label_all(checked, SETTINGS, storage, HereEngine()).drives
+    assert found.verdict == "good"
+
+
 def test_drives_that_are_gone_and_broken_cameras_are_named_and_stop_nothing(
     tiny: Path, tmp_path: Path, mapping: list[str]
 ):

@@ -121,22 +121,34 @@ def test_maps_that_did_not_fit_are_joined_again_if_that_is_asked_for(
     drives = on("hall", tiny, tmp_path, "a", "elsewhere")
     run(tmp_path / "out", drives)
     assert run(tmp_path / "out", drives, refused_again=True)[1] == ["hall"]
-    assert joining == [["a", "elsewhere"]] * 2
+    # What is new has nothing that could be swept away.
+    drives += on("yard", tiny, tmp_path, "x", "y")
+    assert run(tmp_path / "out", drives, refused_again=True)[1] == ["x", "y", "hall", "yard"]
+    assert joining == [["a", "elsewhere"]] * 3 + [["x", "y"]]
 
 
 def test_maps_that_could_not_be_compared_are_named_and_compared_in_the_next_run(
     tiny: Path, tmp_path: Path, joining: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ):
-    def broken(folder: Path) -> str:
-        raise LanenetError(f"{folder.name}: cannot be read")
+    def name_of(folder: Path) -> str:
+        return str(json.loads((folder / "result.json").read_text())["name"])
+
+    def read(folder: Path) -> str:
+        if broken == name_of(folder):
+            raise LanenetError(f"{broken}: cannot be read")
+        return ""
 
     drives = on("", tiny, tmp_path, "a", "b", "c")
-    with monkeypatch.context() as patch:
-        patch.setattr(tracks, "read_shape", broken)
-        result, _ = run(tmp_path / "out", drives, find_tracks=True)
-    assert [text.partition(":")[0] for text in result.uncompared] == ["track of b", "track of c"]
+    monkeypatch.setattr(tracks, "read_shape", read)
+    monkeypatch.setattr(tracks, "recognise", lambda one, other: Recognised("different", ""))
+    broken = "b"
+    result, _ = run(tmp_path / "out", drives, find_tracks=True)
+    key = result.drives[1].map_key
+    assert result.uncompared == ("track of b: b: cannot be read", f"the map {key}: b: cannot be read")
     assert "ould not be compared: track of b" in (tmp_path / "out" / "index.html").read_text()
-    monkeypatch.setattr(tracks, "read_shape", lambda folder: "")
+    # The others were compared for all that.
+    assert len(json.loads((tmp_path / "out" / "alike.json").read_text())) == 1
+    broken = ""
     monkeypatch.setattr(tracks, "recognise", lambda one, other: Recognised("same", ""))
     result, _ = run(tmp_path / "out", drives, find_tracks=True)
     assert result.uncompared == () and result.tracks[0].joined == ("a", "b", "c")

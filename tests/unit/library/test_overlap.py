@@ -110,6 +110,10 @@ def test_the_same_bytes_are_found_though_frames_were_left_out(pictures: list[np.
     assert find_overlaps(one, other) == [
         Overlap((int(kept[0]), int(kept[-1])), (0, 59), 60, same_bytes=True, difference=0.0)
     ]
+    turned = Recording("", Fingerprint(np.arange(60), f.digests[kept[::-1]], f.hashes[kept[::-1]]))
+    assert find_overlaps(one, turned) == [
+        Overlap((int(kept[0]), int(kept[-1])), (0, 59), 60, same_bytes=True, difference=0.0)
+    ]
     few = Recording("", Fingerprint(np.arange(7), f.digests[:7], f.hashes[:7]))
     assert find_overlaps(one, few) == []
 
