@@ -69,7 +69,15 @@ class LibraryError(LanenetError):
 
 
 class SameRecordingError(LibraryError):
-    """A library holds the recording already, under another name."""
+    """A library holds the recording already.
+
+    Attributes:
+        name: Its name there.
+    """
+
+    def __init__(self, message: str, name: str) -> None:
+        super().__init__(message)
+        self.name = name
 
 
 class MapFormatError(LanenetError):

@@ -273,6 +273,10 @@ def _add(
     if here is not None and not force:
         library.check(here.name)
         console.say(f"{path}: is in the library as {here.name}")
+        if any(told.values()):
+            console.show_problems(
+                [f"{here.name}: what was said of it is not changed; use lanenet drives set"]
+            )
         return
     try:
         with console.progress_bar(f"read {path.name}") as progress:
@@ -281,6 +285,10 @@ def _add(
         if name is not None:
             raise
         console.say(f"{error}; not added again")
+        there = library.path_of(library.get(error.name))
+        if not there.exists():
+            moved = f"{there} is gone: lanenet drives remove {error.name}, then add {path} again"
+            console.show_problems([moved])
         return
     how = "copied" if entry.copied else "by reference"
     console.say(

@@ -186,6 +186,8 @@ def show_result(result: FleetResult, out: str) -> None:
     Raises:
         LanenetError: If some failed, or were left when a disk was full.
     """
+    from datagen.fleet.page import FLEET_PAGE_NAME
+
     labelled, refused = result.with_labels, result.of("reject", "refused")
     failed, left, twice = (result.of(verdict) for verdict in ("failed", "left", "duplicate"))
     new = sum(found.new for found in result.drives)
@@ -204,6 +206,7 @@ def show_result(result: FleetResult, out: str) -> None:
         problems += [f"{name} {why}" for name, why in joint.left_out.items()]
         console.show_problems([*problems, *(f"laid anew: {text}" for text in joint.relaid)])
     console.show_problems([f"could not be compared: {text}" for text in result.uncompared])
+    console.say(f"wrote {out.rstrip('/')}/{FLEET_PAGE_NAME}")
     again = "run the command again: what is finished is kept"
     if result.disk_full:
         raise LanenetError(f"{result.disk_full}; {counted(len(left), 'drive')} left; make room, then {again}")

@@ -321,7 +321,8 @@ class Library:
         if same is not None and not force:
             raise SameRecordingError(
                 f"{self.path_of(entry)}: the same recording as {same[0]} of the library: the images and "
-                f"commands of all {entry.frames} frames are equal"
+                f"commands of all {entry.frames} frames are equal",
+                str(same[0]),
             )
         taken = {row[0] for row in connection.execute("SELECT name FROM drives")}
         if entry.name:

@@ -63,10 +63,17 @@ def test_the_same_recording_is_named_and_not_added_again(here: Path) -> None:
         "other_name: the same recording as whole of the library: the images and commands of all 120" in said
     )
     assert "whole: is in the library as whole" in done("add", "whole")
+    assert "is not changed; use lanenet drives set" in run("add", "whole", "--car", "red").output
     assert [entry.name for entry in Library.open().entries()] == ["whole"]
     assert "same recording as whole" in refused(here, "drives", "add", "other_name", "--name", "b")
     said = done("add", "other_name", "--force")
     assert "other_name has the same images as whole: its frames 0 to 119" in said
+
+
+def test_a_drive_that_was_moved_says_how_it_is_known_at_its_new_place(here: Path) -> None:
+    done("add", "whole")
+    shutil.move(here / "whole", here / "moved")
+    assert "whole is gone: lanenet drives remove whole, then add moved again" in run("add", "moved").stderr
 
 
 def test_a_drive_that_changed_since_is_not_taken_for_what_it_was(here: Path) -> None:

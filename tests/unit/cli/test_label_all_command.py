@@ -128,6 +128,7 @@ def test_cars_and_tracks_are_told(capsys: pytest.CaptureFixture[str]):
     said = "".join(capsys.readouterr())
     assert "camera of red: found from a, b" in said and "c keeps its own camera: another camera" in said
     assert "hall: 2 of 3 maps joined" in said and "c is of another track" in said
+    assert "wrote out/index.html" in said
     assert "yard: 0 of 2 maps joined" in said and "no two of 2 maps are joined" in said
 
 
