@@ -51,7 +51,8 @@ CLOCK_STEP_NS = 10**8
 #: What makes a command small.
 SMALLER = {
     "simulate": f"frames={FRAMES}",
-    "train": "learn.epochs=1 learn.threads=1 data.workers=1",
+    # One of the configs trains what lies there as a copy of the general network.
+    "train": "--force learn.epochs=1 learn.threads=1 data.workers=1",
     "sweep": "--trials 1 --minutes 2",
     "bench": "--rounds 10",
     "judge": "--count 1 --laps 1",
