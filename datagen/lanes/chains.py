@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from datagen.lanes.tape import SHORTEST, Piece
+from datagen.lanes.tape import BENT, SHORTEST, Piece
 
 #: Whether a marking of a width lies along a straight way from one point to another, place by place.
 OnMarking = Callable[[Float[np.ndarray, "2"], Float[np.ndarray, "2"], float], Bool[np.ndarray, "m"]]
@@ -19,6 +19,9 @@ _LEAST_RAD, _MOST_RAD = np.deg2rad(8.0), np.deg2rad(120.0)
 #: Least turn of a corner relative to that of an arc from the middle of one of its pieces, which bends, to the
 #: other one. Derived: chords of an arc turn by up to twice as much; the rest is margin.
 _SHARPER = 3.0
+#: Least turn of a corner between pieces as long as the camera is high; shorter ones need more. Derived: an
+#: arc that turns by this over a piece bends it by 0.3 / 8 of that as root mean square, as much as it may.
+_HIDDEN_RAD = 8.0 / 0.3 * BENT
 #: Longest way from the end of a piece to a corner, and how far a piece may go on beyond it, in camera
 #: heights. Chosen: borders are hidden or blurred about a corner; tape is laid over the end of another.
 _AHEAD, _BEYOND = 0.8, 0.4
@@ -149,6 +152,8 @@ class _Joiner:
         if abs(turn) >= _LEAST_RAD:
             ways = np.linalg.solve(np.column_stack([one, two]), apart)
             if min(ways) < -_BEYOND * h or max(ways) > _AHEAD * h:
+                return None
+            if abs(turn) < _HIDDEN_RAD * h / min(before.length_cm, after.length_cm):
                 return None
             if abs(turn) < _SHARPER * _arc_rad(before, after, float(np.maximum(ways, 0.0).sum()), turn):
                 return None
