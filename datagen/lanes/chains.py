@@ -20,8 +20,9 @@ _LEAST_RAD, _MOST_RAD = np.deg2rad(8.0), np.deg2rad(120.0)
 #: other one. Derived: chords of an arc turn by up to twice as much; the rest is margin.
 _SHARPER = 3.0
 #: Least turn of a corner between pieces as long as the camera is high; shorter ones need more. Derived: an
-#: arc that turns by this over a piece bends it by 0.3 / 8 of that as root mean square, as much as it may.
-_HIDDEN_RAD = 8.0 / 0.3 * BENT
+#: arc that turns by half of this over a piece bends it by 0.3 / 8 of that as root mean square, as much as it
+#: may; the rest is what the arc turns between the pieces.
+_HIDDEN_RAD = 2.0 * 8.0 / 0.3 * BENT
 #: Longest way from the end of a piece to a corner, and how far a piece may go on beyond it, in camera
 #: heights. Chosen: borders are hidden or blurred about a corner; tape is laid over the end of another.
 _AHEAD, _BEYOND = 0.8, 0.4
