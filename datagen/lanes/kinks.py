@@ -247,6 +247,8 @@ class _Search:
         margin_cm = 0.5 * _PLACE * self.height_cm
         corners_cm = chain.lengths_cm[1:-1]
         corners_cm = corners_cm[(corners_cm > from_cm + 2 * margin_cm) & (corners_cm < to_cm - 2 * margin_cm)]
+        if not len(corners_cm) and (rows[0] < 0 or rows[3] >= len(past_cm)):
+            return None  # one straight piece, which the line passes at one end only
         off_cm = np.abs(self._off_way(chain, np.concatenate([[from_cm], corners_cm, [to_cm]])))
         if len(corners_cm):
             taken_cm = min(taken_cm, corners_cm[0] - margin_cm)
