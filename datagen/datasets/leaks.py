@@ -150,7 +150,7 @@ def _refuse_shared_tracks(jobs: Sequence[RecordedJob]) -> None:
         one, other = first.recording, second.recording
         if not _may_leak(one, other):
             continue
-        if one.track and same_track(one.track, other.track):
+        if one.track and _spelt(one.track) == _spelt(other.track):
             shared, instead = f"of the track {one.track!r}", "leave out 'track'"
         elif first.joined_in is not None and first.joined_in == second.joined_in:
             shared, instead = f"joined in {first.joined_in}", "list that folder"
@@ -164,12 +164,8 @@ def _refuse_shared_tracks(jobs: Sequence[RecordedJob]) -> None:
         )
 
 
-def same_track(one: str, other: str) -> bool:
-    """Tell whether two names are of one track: capitals and spaces are typed in one way or another."""
-    return _spelt(one) == _spelt(other)
-
-
 def _spelt(track: str) -> str:
+    """Return the name of a track without what is typed in one way or another: capitals and spaces."""
     return " ".join(track.casefold().split())
 
 

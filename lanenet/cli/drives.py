@@ -252,11 +252,9 @@ def _drives_of(library: Library, sources: list[Path]) -> list[Path]:
         inside = [path for path in inside if not path.resolve().is_relative_to(library.copies)]
         inside = [path for path in inside if not (path.parent / "map.yaml").is_file()]
         if not inside:
-            if not source.exists():
-                raise ConfigError(f"{source}: no such drive or folder{meant_instead(source)}")
-            raise ConfigError(
-                f"{source}: no drive, and holds none; expected {formats_text()}, or a folder of them"
-            )
+            what = "no drive, and holds none" if source.exists() else "no such drive or folder"
+            meant = "" if source.exists() else meant_instead(source)
+            raise ConfigError(f"{source}: {what}; expected {formats_text()}, or a folder of them{meant}")
         found += inside
     return list(dict.fromkeys(found))
 

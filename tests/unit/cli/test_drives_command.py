@@ -147,8 +147,8 @@ def test_a_drive_that_was_not_copied_is_never_removed_from_disk(here: Path) -> N
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("add", "nowhere"), "nowhere: no such drive or folder"),
-        (("add", "wohle"), "wohle: no such drive or folder; did you mean whole?"),
+        (("add", "nowhere"), "nowhere: no such drive or folder; expected a drive folder"),
+        (("add", "wohle"), "or a folder of them; did you mean whole?"),
         (("add", "club", "--name", "x"), "--name x: is for a single drive, but 2 drives are given"),
         (("show", "wohle"), "no drive 'wohle', did you mean 'whole'?"),
         (("list", "--library", "none.sqlite"), "no such library; lanenet drives add makes it"),
