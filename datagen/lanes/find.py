@@ -115,7 +115,7 @@ def find_lane(
     lines = fit_lines(path, edges, lane, height, fit, adjacent)
     near = edges_on_map(scans, segment.poses, camera.wheelbase_cm, _KINK_HEIGHTS * height, lead_cm)
     near = near.towards_dark() if dark else near
-    lines = [with_kinks(line, near, height) if line.rank == 0 else line for line in lines]
+    lines = [with_kinks(line, near, height, lane.lane_cm) if line.rank == 0 else line for line in lines]
     return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm)
 
 

@@ -297,6 +297,10 @@ class MapEdges:
     row: Int[np.ndarray, "m"]
     distance_cm: Float[np.ndarray, "m"]
 
+    def select(self, rows: Bool[np.ndarray, "m"]) -> MapEdges:
+        """Return some of the points."""
+        return MapEdges(*(getattr(self, item.name)[rows] for item in fields(self)))
+
     def towards_dark(self) -> MapEdges:
         """Return the points with normals to the darker side, as :meth:`PathEdges.towards_dark`."""
         return replace(self, normals=-self.normals)

@@ -13,7 +13,7 @@ from datagen.lanes.offset import CubicBasis
 from datagen.lanes.path import MapEdges
 from lanenet.data.maps.line import LaneLine
 
-HEIGHT_CM, TAPE_CM, SIDE_CM = 18.0, 2.4, 160.0
+HEIGHT_CM, TAPE_CM, SIDE_CM, LANE_CM = 18.0, 2.4, 160.0, 40.0
 #: How far a smooth line cuts a corner.
 CUT_CM = 30.0
 
@@ -86,7 +86,7 @@ def test_a_line_goes_through_the_corners_of_its_tape(angle_deg):
     course = _corners(angle_deg)
     line = _smooth(course)
     assert _off_cm(line, course) > 1.5
-    found = with_kinks(line, _borders(course), HEIGHT_CM)
+    found = with_kinks(line, _borders(course), HEIGHT_CM, LANE_CM)
     assert len(found.kinks_cm) == 3
     at = found.everywhere(found.kinks_cm)
     np.testing.assert_allclose(at, course[1:-1], atol=0.4)
@@ -98,7 +98,7 @@ def test_a_line_goes_through_the_corners_of_its_tape(angle_deg):
 
 def test_a_corner_at_the_seam_of_a_lap_is_found():
     course = _square()
-    found = with_kinks(_smooth(course, closed=True), _borders(course), HEIGHT_CM)
+    found = with_kinks(_smooth(course, closed=True), _borders(course), HEIGHT_CM, LANE_CM)
     assert len(found.kinks_cm) == 4
     assert _off_cm(found, course) < 0.4
     period = float(found.period_cm or 0.0)
@@ -114,7 +114,7 @@ def test_what_was_not_supported_at_a_corner_is_once_it_is_seen():
     course = _corners(90.0)
     line = _smooth(course)
     line = replace(line, supported_cm=np.array([[0.0, 140.0], [180.0, 640.0]]))
-    found = with_kinks(line, _borders(course), HEIGHT_CM)
+    found = with_kinks(line, _borders(course), HEIGHT_CM, LANE_CM)
     assert found.supported(np.array([150.0, 160.0, 170.0])).all()
 
 
@@ -132,18 +132,42 @@ def test_a_bend_gets_no_kink_even_where_the_line_leaves_it(radius_cm, off_cm):
     basis = CubicBasis(line.knots_cm[3:-3], False)
     moved = basis.fitted(s_cm, line.everywhere(s_cm) + hump[:, None] * left)
     line = replace(line, coefficients_cm=moved)
-    assert not len(with_kinks(line, _borders(course), HEIGHT_CM).kinks_cm)
+    assert not len(with_kinks(line, _borders(course), HEIGHT_CM, LANE_CM).kinks_cm)
 
 
 def test_a_corner_that_was_not_seen_gets_no_kink():
     course, edges = _corners(60.0), _borders(_corners(60.0))
     hidden = np.min([np.hypot(*(edges.xy_cm - corner).T) for corner in course[1:-1]], axis=0) < 15.0
     kept = MapEdges(*(column[~hidden] for column in vars(edges).values()))
-    assert not len(with_kinks(_smooth(course), kept, HEIGHT_CM).kinks_cm)
+    assert not len(with_kinks(_smooth(course), kept, HEIGHT_CM, LANE_CM).kinks_cm)
+
+
+def test_a_line_that_followed_something_else_beyond_a_corner_comes_back_to_its_tape():
+    course = _corners(60.0)
+    line = _smooth(course)
+    s_cm = np.linspace(0.0, line.knots_cm[-4] - 1e-9, 800)
+    ahead = line.everywhere(s_cm, 1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    # From the first corner to the second it lies 8 cm beside the tape, a fifth of the lane.
+    aside = 8.0 * np.clip(np.minimum(s_cm - SIDE_CM + 20.0, 2.0 * SIDE_CM - s_cm + 20.0) / 20.0, 0.0, 1.0)
+    basis = CubicBasis(line.knots_cm[3:-3], False)
+    wrong = replace(line, coefficients_cm=basis.fitted(s_cm, line.everywhere(s_cm) + aside[:, None] * left))
+    assert _off_cm(wrong, course) > 7.0
+    found = with_kinks(wrong, _borders(course), HEIGHT_CM, LANE_CM)
+    assert len(found.kinks_cm) == 3
+    assert _off_cm(found, course) < 0.6
+
+
+def test_tape_half_a_lane_away_is_something_else():
+    course = _corners(60.0)
+    line = _smooth(course)
+    beside = _smooth(course + [0.0, 0.5 * LANE_CM])
+    assert with_kinks(beside, _borders(course), HEIGHT_CM, LANE_CM) is beside
+    assert len(with_kinks(line, _borders(course), HEIGHT_CM, LANE_CM).kinks_cm) == 3
 
 
 def test_dark_tape_has_the_same_corners():
     course = _corners(60.0)
     edges = _borders(course)
     dark = replace(edges, normals=-edges.normals)
-    assert len(with_kinks(_smooth(course), dark.towards_dark(), HEIGHT_CM).kinks_cm) == 3
+    assert len(with_kinks(_smooth(course), dark.towards_dark(), HEIGHT_CM, LANE_CM).kinks_cm) == 3
