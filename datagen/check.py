@@ -17,7 +17,7 @@ from datagen.quality.figures import (
 )
 from datagen.quality.measure import VERDICT_REACH_CM, MapQuality, measure_map, quality_figures
 from datagen.quality.places import withheld_figures, withhold_wrong_places
-from datagen.quality.residuals import REFERENCE_WIDTH, contradicted_lines, summarise
+from datagen.quality.residuals import contradicted_lines, summarise
 from datagen.quality.verdict import Verdict, judge
 from lanenet.data.drives import Drive
 from lanenet.data.maps.mapped_drive import MappedDrive, points_text
@@ -74,7 +74,7 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     mapped, quality = compare_with_frames(mapped)
     drive_map = mapped.drive_map
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
-    figures |= quality_figures(quality, drive.width)
+    figures |= quality_figures(quality)
     figures["withheld"] = withheld_figures(drive_map, list(quality.wrong))
     figures["lane_width"] = asdict(assembled.lane)
     figures["steering_correlation"] = steering_correlation(mapped)
@@ -124,7 +124,7 @@ def check_lines_seen(
             f"borders of its lines, expected {100.0 * _LEAST_COVERAGE:.0f} % at least"
         )
     lines = {side: summarise(near.select(near.right == (side == "right"))) for side in SIDES}
-    sd_px = {side: line.robust_sd_px * REFERENCE_WIDTH / drive.width for side, line in lines.items()}
+    sd_px = {side: line.robust_sd_px * quality.scale for side, line in lines.items()}
     chance = summarise(quality.chance.select(quality.chance.ahead_cm < VERDICT_REACH_CM)).coverage
     clutter = [
         side

@@ -23,6 +23,7 @@ from lanenet.data.maps.mapped_drive import (
     DELETED,
     NO_LINE,
     NOT_TO_LABEL,
+    OUTSIDE,
     UNCERTAIN,
     label_frames,
     labelled_points,
@@ -83,7 +84,7 @@ def label_map(
     found = label_frames(mapped, window)
     left_out = {
         reason: found.reasons.count(reason)
-        for reason in (DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE)
+        for reason in (DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE, OUTSIDE)
     }
     rows = np.array([k for k, reason in enumerate(found.reasons) if not reason], dtype=np.int64)
     if not rows.size:
@@ -178,7 +179,8 @@ def frame_residual_cm(points_cm: Float[np.ndarray, "m 2"], lines: FrameLines, ta
         if len(known) < 2 or not len(near):
             continue
         offset = np.abs(_distance_to_polyline(near, known))
-        marking_cm = lines.marking_cm(side, tape_cm)
+        # Of most of what lies in the image: a frame shows little of the line.
+        marking_cm = float(np.median(lines.markings_cm(side, tape_cm)))
         distances.append(np.abs(offset[offset < 1.5 * marking_cm + 1.0] - 0.5 * marking_cm))
     found = np.concatenate(distances) if distances else np.empty(0)
     return float(np.median(found)) if found.size >= 10 else float("nan")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,6 +22,7 @@ from datagen.lanes.trace import (
     trace_known_lane,
     trace_lane,
 )
+from datagen.lanes.widths import marking_widths
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.drives import Drive
 from lanenet.data.maps.line import LaneLine
@@ -116,6 +117,7 @@ def find_lane(
     near = edges_on_map(scans, segment.poses, camera.wheelbase_cm, _KINK_HEIGHTS * height, lead_cm)
     near = near.towards_dark() if dark else near
     lines = [with_kinks(line, near, height, lane.lane_cm) if line.rank == 0 else line for line in lines]
+    lines = [replace(line, marking_at_cm=marking_widths(line, near, height)) for line in lines]
     return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm)
 
 

@@ -23,6 +23,7 @@ from datagen.quality.residuals import (
     border_samples,
     frame_edges,
     join_samples,
+    reference_scale,
     summarise,
 )
 from lanenet.data.maps.mapped_drive import (
@@ -58,6 +59,7 @@ class MapQuality:
         points_cm: Six labels per frame of the map.
         in_window: Which points a complete map would label; none for frames that are not to be labelled.
         wrong: Sections of the lines that are withheld, the longest first.
+        scale: Reference pixels per pixel, see :func:`datagen.quality.residuals.reference_scale`.
     """
 
     held_out: Int[np.ndarray, "h"]
@@ -67,6 +69,7 @@ class MapQuality:
     points_cm: Float[np.ndarray, "n 6"]
     in_window: Bool[np.ndarray, "n 6"]
     wrong: tuple[WrongPlace, ...] = ()
+    scale: float = 1.0
 
     @property
     def near(self) -> BorderSamples:
@@ -86,7 +89,7 @@ class MapQuality:
 
     @property
     def labelled_share(self) -> float:
-        """Share of frames with labels, of those that are neither deleted nor between two lanes."""
+        """Share of frames with labels, of those that a complete map would label."""
         kept = [status for status in self.status if status not in NOT_TO_LABEL]
         return sum(status == LABELLED for status in kept) / max(len(kept), 1)
 
@@ -117,10 +120,12 @@ def measure_map(mapped: MappedDrive) -> MapQuality:
     labels = label_frames(mapped, BirdseyeWindow())
     for row, reason in zip(mapped.rows.tolist(), labels.reasons, strict=True):
         status[row] = reason or LABELLED
-    return MapQuality(rows, samples, join_samples(chance), status, labels.points_cm, labels.in_window)
+    scale = reference_scale(drive_map.camera)
+    points_cm, in_window = labels.points_cm, labels.in_window
+    return MapQuality(rows, samples, join_samples(chance), status, points_cm, in_window, scale=scale)
 
 
-def quality_figures(quality: MapQuality, width: int) -> dict[str, Any]:
+def quality_figures(quality: MapQuality) -> dict[str, Any]:
     """Return the report's figures: residuals by line and distance, coverage, and labelled shares."""
     every, near = join_samples(quality.samples), quality.near
     chance = quality.chance.select(quality.chance.ahead_cm < VERDICT_REACH_CM)
@@ -130,11 +135,11 @@ def quality_figures(quality: MapQuality, width: int) -> dict[str, Any]:
         bands = {
             f"{low:g}-{high:g} cm": summarise(
                 part.select((part.ahead_cm >= low) & (part.ahead_cm < high))
-            ).as_dict(width)
+            ).as_dict(quality.scale)
             for low, high in pairwise(BANDS_CM)
         }
         within = part.select(part.ahead_cm < VERDICT_REACH_CM)
-        lines[side] = {f"0-{VERDICT_REACH_CM:g} cm": summarise(within).as_dict(width), "bands": bands}
+        lines[side] = {f"0-{VERDICT_REACH_CM:g} cm": summarise(within).as_dict(quality.scale), "bands": bands}
     medians = quality.frame_median_px
     known = medians[np.isfinite(medians)]
     return {
@@ -143,7 +148,7 @@ def quality_figures(quality: MapQuality, width: int) -> dict[str, Any]:
             "what": "edges of these frames had no say in the lines; their poses come from the chain",
             "reach_cm": VERDICT_REACH_CM,
             "gate_px_at_160": GATE_PX,
-            "both_lines": summarise(near).as_dict(width),
+            "both_lines": summarise(near).as_dict(quality.scale),
             "coverage_by_chance": summarise(chance).coverage,
             "lines": lines,
             "frame_median_px": {

@@ -102,7 +102,7 @@ def report_page(
                 "Along the drive: above, how far each held-out frame lies from the map; below, which frames "
                 "have labels, and why others get none.",
                 frames_plot,
-                *(quality, drive, drive_map, drive.width),
+                *(quality, drive, drive_map),
             ),
         ),
         details(
@@ -155,9 +155,9 @@ def _residuals(
             "Above: distance of edges from the lines by how far ahead they are; dotted: the bounds of a good "
             "map. Below: how much of the lines' borders met an edge.",
             residual_plot,
-            *(quality, drive.width, settings.max_sd_px, settings.max_p95_px),
+            *(quality, settings.max_sd_px, settings.max_p95_px),
         ),
-        table(residual_rows(held, drive.width)),
+        table(residual_rows(held, quality.scale)),
     ]
 
 

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.quality.measure import MapQuality
 from datagen.quality.places import WrongPlace
-from datagen.quality.residuals import REFERENCE_WIDTH
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
@@ -205,11 +204,11 @@ def held_out_pictures(mapped: MappedDrive, quality: MapQuality) -> dict[str, lis
 
 
 def _held_out(mapped: MappedDrive, quality: MapQuality, picks: np.ndarray) -> list[Picture]:
-    drive_map, scale = mapped.drive_map, REFERENCE_WIDTH / mapped.drive.width
+    drive_map = mapped.drive_map
     pictures = []
     for i in picks:
         k, median_px = int(quality.held_out[i]), quality.frame_median_px[i]
-        found = f"{median_px * scale:.2f} px" if np.isfinite(median_px) else "nothing found"
+        found = f"{median_px * quality.scale:.2f} px" if np.isfinite(median_px) else "nothing found"
         drawn = draw_lines(_frame(mapped, k), lines_at(drive_map, k), drive_map.camera_at(k), "")
         pictures.append(Picture(drawn, f"frame {drive_map.frames[k]}: {found}"))
     return pictures

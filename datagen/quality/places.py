@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from scipy.ndimage import uniform_filter1d
 
-from datagen.quality.residuals import REFERENCE_WIDTH, frame_edges, in_view
+from datagen.quality.residuals import frame_edges, in_view, reference_scale
 from datagen.slam.commands import MOST_BRIDGED
 from datagen.slam.odometry.scans import lift_tilted
 from lanenet.data.maps.folder import DriveMap
@@ -263,13 +263,14 @@ def gather_evidence(mapped: MappedDrive) -> dict[tuple[int, int], PlaceEvidence]
             uv, beside_uv = (tilted.project_ground(seen.at_cm + by_cm * seen.right) for by_cm in (0.0, 0.2))
             shown = in_view(uv, beside_uv, keep)
             seen = SeenPlaces(*(column[shown] for column in seen))
+            widths_cm = line.widths_cm(_first_cm(line) + (seen.place + 0.5) * _PLACE_CM)
+            widths_cm = np.where(np.isfinite(widths_cm), widths_cm, drive_map.meta.tape_cm)
             px_per_cm = np.linalg.norm(beside_uv - uv, axis=1)[shown] / 0.2
-            met_px = _MET_PX * camera.width / REFERENCE_WIDTH
+            met_px = _MET_PX / reference_scale(camera)
             met_cm = np.maximum(_MET_CM, met_px / np.maximum(px_per_cm, 1e-6))
-            width_cm = line.marking_cm if np.isfinite(line.marking_cm) else drive_map.meta.tape_cm
             most_cm = min(_BESIDE_CM, _BESIDE_LANES * drive_map.meta.mapped_lane_cm)
             off_cm, both, beside, pairs = _borders_beside(
-                road.points_cm, road.normals, seen.at_cm, seen.right, met_cm, width_cm, most_cm
+                road.points_cm, road.normals, seen.at_cm, seen.right, met_cm, widths_cm, most_cm
             )
             if not drive_map.lanes.forward[k]:
                 off_cm, beside, pairs = -off_cm, beside[:, ::-1], pairs[:, ::-1]
@@ -596,7 +597,7 @@ def _passes(drive_map: DriveMap) -> Int[np.ndarray, "n"]:
 
 @njit(cache=True)
 @no_type_check
-def _borders_beside(points, normals, at, right, met_cm, width_cm, most_cm):
+def _borders_beside(points, normals, at, right, met_cm, widths_cm, most_cm):
     """Find the borders at and beside each place.
 
     Args:
@@ -605,7 +606,7 @@ def _borders_beside(points, normals, at, right, met_cm, width_cm, most_cm):
         at: The places.
         right: Unit vectors to the right of the line there.
         met_cm: Largest distance at which a border is met.
-        width_cm: Width of the marking.
+        widths_cm: Width of the marking there.
         most_cm: Largest distance of a border beside the line.
 
     Returns:
@@ -629,7 +630,7 @@ def _borders_beside(points, normals, at, right, met_cm, width_cm, most_cm):
             if abs(agree) < _MET_COSINE:
                 continue
             # The left border brightens to the right.
-            d = dx * right[i, 0] + dy * right[i, 1] + (0.5 if agree > 0.0 else -0.5) * width_cm
+            d = dx * right[i, 0] + dy * right[i, 1] + (0.5 if agree > 0.0 else -0.5) * widths_cm[i]
             if abs(d) <= best:
                 off[i], best = d, abs(d)
             if abs(d) <= met_cm[i]:

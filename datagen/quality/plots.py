@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
-from datagen.quality.residuals import REFERENCE_WIDTH, join_samples, summarise
+from datagen.quality.residuals import join_samples, summarise
 from datagen.slam.commands import SteeringFit, commands_of, delayed
 from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap
@@ -57,11 +57,10 @@ def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"])
     return png_bytes(figure)
 
 
-def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px: float) -> bytes:
+def residual_plot(quality: MapQuality, max_sd_px: float, max_p95_px: float) -> bytes:
     """Residuals and coverage over the distance ahead, by line."""
     figure, (axes, below) = _figure(4.4, 2)
     every = join_samples(quality.samples)
-    scale = REFERENCE_WIDTH / width
     edges = np.arange(0.0, max(float(every.ahead_cm.max(initial=0.0)), VERDICT_REACH_CM) + _BIN_CM, _BIN_CM)
     centres = 0.5 * (edges[:-1] + edges[1:])
     for side in SIDES:
@@ -71,8 +70,8 @@ def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px:
             for a, b in pairwise(edges.tolist())
         ]
         for name, style, values in (
-            ("p95", ".--", [scale * b.p95_px for b in bins]),
-            ("robust sd", "o-", [scale * b.robust_sd_px for b in bins]),
+            ("p95", ".--", [quality.scale * b.p95_px for b in bins]),
+            ("robust sd", "o-", [quality.scale * b.robust_sd_px for b in bins]),
         ):
             axes.plot(centres, values, style, color=_COLOURS[side], label=f"{side}, {name}", lw=0.9, ms=3)
         below.plot(centres, [100.0 * b.coverage for b in bins], "o-", color=_COLOURS[side], label=side, ms=3)
@@ -86,10 +85,10 @@ def residual_plot(quality: MapQuality, width: int, max_sd_px: float, max_p95_px:
     return png_bytes(figure)
 
 
-def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap, width: int) -> bytes:
+def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap) -> bytes:
     """Residuals of held-out frames, and labelled frames with the reasons of the others, along the drive."""
     figure, (axes, strip) = _figure(5.0, 2)
-    median_px = quality.frame_median_px * REFERENCE_WIDTH / width
+    median_px = quality.frame_median_px * quality.scale
     axes.plot(drive_map.frames[quality.held_out], median_px, ".", color="#2060c0", ms=4)
     axes.set_ylim(bottom=0.0)
     axes.set_ylabel("median residual\nof held-out frame, px", fontsize=8)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from datagen.quality.residuals import REFERENCE_WIDTH
 from lanenet.data.maps.folder import DriveMap, MapMeta
 from lanenet.errors import counted
 from lanenet.geometry.camera import Camera
@@ -23,9 +22,9 @@ def number(value: float | None, decimals: int = 2) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
 
 
-def residual_rows(held_out: dict[str, Any], width: int) -> list[Row]:
+def residual_rows(held_out: dict[str, Any], scale: float) -> list[Row]:
     """Residuals by line and distance, in pixels of the image and of an image 160 px wide."""
-    wide = width != REFERENCE_WIDTH
+    wide = scale != 1.0
     own = ("sd, px", "p95, px", "offset, px")
     header = ("", "places", "found, %", *own, *(f"{name} at 160" for name in own if wide))
     keys = ("robust_sd_px", "p95_px", "median_px")

@@ -56,6 +56,7 @@ class MapEvidence:
         height_given: Whether the focal length was found with a given height of the camera.
         given_height_cm: That height; None if none was given.
         given_tape_cm: Width of the tape that the user gave; None if none was given.
+        tape_range_cm: Narrowest and widest twentieth of the tape along a line, if it varies much; else None.
         steering: Correlation of the path's curvature with the steering command, both positive to the left;
             None where it is too weak to tell, or nothing was commanded.
         withheld: Sections of the lines that are withheld because the images contradict them, in words.
@@ -83,6 +84,7 @@ class MapEvidence:
     height_given: bool = False
     given_height_cm: float | None = None
     given_tape_cm: float | None = None
+    tape_range_cm: tuple[float, float] | None = None
     steering: float | None = None
     withheld: tuple[str, ...] = ()
     withheld_share: float = 0.0
@@ -277,6 +279,12 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
         yield (
             f"the lane is {width_cm:.1f} cm wide on straights and {e.bend_lane_cm:.1f} cm in bends; the lane "
             "width to give is that of the straights"
+        )
+    if e.tape_range_cm is not None:
+        low, high = e.tape_range_cm
+        yield (
+            f"the tape is {low:.1f} cm wide in some places and {high:.1f} cm in others: if it is one roll, "
+            "the floor is not flat there; labels lie on the tape as the camera sees it, not as a ruler does"
         )
     if e.found_lane_cm is not None:
         return

@@ -74,7 +74,7 @@ def check(mapped: MappedDrive, good_cm: np.ndarray, folder: Path) -> tuple[str, 
     """
     mapped, quality = compare_with_frames(mapped)
     figures = json.loads((folder / "report.json").read_text())
-    figures |= quality_figures(quality, mapped.drive.width)
+    figures |= quality_figures(quality)
     figures["withheld"] = withheld_figures(mapped.drive_map, list(quality.wrong))
     evidence = map_evidence(mapped.drive_map, figures, mapped.drive.deleted[mapped.rows], None)
     grade = judge(evidence, VerdictSettings()).grade

@@ -181,6 +181,7 @@ def write_map(
             "supported_cm": line.supported_cm,
             "residual_cm": line.residual_cm,
             "marking_cm": line.marking_cm,
+            "marking_at_cm": line.marking_at_cm,
             "bare_share": line.unpainted,
             "sigma_s_cm": line.sigma_s_cm,
             "sigma_at_cm": line.sigma_at_cm,
@@ -390,6 +391,8 @@ def _line(item: dict[str, Any]) -> LaneLine:
         np.array(item[f"{name}_cm"], dtype=np.float64)
         for name in ("knots", "coefficients", "supported", "contradicted", "sigma_s", "sigma_at")
     )
+    # Older maps have one width for each line.
+    widths = np.array(item.get("marking_at_cm", []), dtype=np.float64)
     if item["side"] not in ("left", "right"):
         raise ValueError(f"side is {item['side']!r}")
     if knots.ndim != 1 or len(knots) < 8 or coefficients.shape != (len(knots) - 4, 2):
@@ -397,7 +400,7 @@ def _line(item: dict[str, Any]) -> LaneLine:
     supported, contradicted = supported.reshape(-1, 2), contradicted.reshape(-1, 2)
     if not all(
         (np.abs(values) <= MAX_PLACE).all()
-        for values in (knots, coefficients, supported, contradicted, sigma_s, sigma_at)
+        for values in (knots, coefficients, supported, contradicted, sigma_s, sigma_at, widths)
     ):
         raise ValueError(f"all numbers must be finite and at most {MAX_PLACE:g}")
     # Four at either end may be equal, where the line begins and ends, and three in between, at a kink.
@@ -421,6 +424,8 @@ def _line(item: dict[str, Any]) -> LaneLine:
         raise ValueError(f"sigma_at_cm has shape {sigma_at.shape}, sigma_s_cm {sigma_s.shape}")
     if not ((np.diff(sigma_s) >= 0.0).all() and (sigma_at >= 0.0).all()):
         raise ValueError("sigma_s_cm must not decrease, and sigma_at_cm not be negative")
+    if widths.shape not in ((0,), sigma_s.shape) or not (widths > 0.0).all():
+        raise ValueError(f"marking_at_cm has shape {widths.shape}, expected {sigma_s.shape}, all positive")
     residual, marking, unpainted = (
         float("nan") if item[name] is None else float(item[name])
         for name in ("residual_cm", "marking_cm", "bare_share")
@@ -443,6 +448,7 @@ def _line(item: dict[str, Any]) -> LaneLine:
         sigma_s_cm=sigma_s,
         sigma_at_cm=sigma_at,
         marking_cm=marking,
+        marking_at_cm=widths,
         unpainted=unpainted,
         contradicted_cm=contradicted,
     )

@@ -37,13 +37,13 @@ class FrameLines:
         left_cm: Left line in the direction of travel, frame car; NaN where it is not supported.
         right_cm: Right line likewise.
         points_cm: The six labels; NaN where masked.
-        markings_cm: Width of the left and the right marking; NaN if unknown.
+        widths_cm: Width of the left and the right marking at the points of their lines; NaN if unknown.
     """
 
     left_cm: Float[np.ndarray, "m 2"]
     right_cm: Float[np.ndarray, "m 2"]
     points_cm: Float[np.ndarray, "6"]
-    markings_cm: tuple[float, float] = (float("nan"), float("nan"))
+    widths_cm: tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]] | None = None
 
     def without(self, hidden: Bool[np.ndarray, "2"]) -> FrameLines:
         """Mask the left, the right or both lines."""
@@ -54,10 +54,11 @@ class FrameLines:
         points_cm = np.where(np.repeat(hidden, N_POINTS // 2), np.nan, self.points_cm)
         return replace(self, left_cm=lines[0], right_cm=lines[1], points_cm=points_cm)
 
-    def marking_cm(self, side: int, usual_cm: float) -> float:
-        """Return the width of the left (0) or right (1) marking; ``usual_cm`` if it is unknown."""
-        own = self.markings_cm[side]
-        return own if np.isfinite(own) else usual_cm
+    def markings_cm(self, side: int, usual_cm: float) -> Float[np.ndarray, "m"]:
+        """Return the width of the left (0) or right (1) marking along its line; ``usual_cm`` if unknown."""
+        line = (self.left_cm, self.right_cm)[side]
+        own = np.full(len(line), np.nan) if self.widths_cm is None else self.widths_cm[side]
+        return np.where(np.isfinite(own), own, usual_cm)
 
 
 def lines_of_frame(
@@ -93,7 +94,7 @@ def lines_of_frame(
     left, right = (_polyline(line, s, pose, wheelbase_cm, max_sigma_cm) for line in bounds)
     points = np.concatenate([label_rows(left, steepest), label_rows(right, steepest)])
     assert points.shape == (N_POINTS,)
-    of_left, of_right = (float("nan") if line is None else line.marking_cm for line in bounds)
+    of_left, of_right = (np.full(len(s), np.nan) if line is None else line.widths_cm(s) for line in bounds)
     return FrameLines(left, right, points, (of_left, of_right))
 
 

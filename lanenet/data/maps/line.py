@@ -46,6 +46,7 @@ class LaneLine:
         unpainted: Share of the line without paint, as near frames see it; NaN if unknown.
         contradicted_cm: Sections (from, to) of s that the images contradict, see
             :mod:`datagen.quality.places`; as for support, one across the seam ends beyond the period.
+        marking_at_cm: Width of the marking where sigma is given; empty if it is the same everywhere.
     """
 
     side: Side
@@ -60,6 +61,7 @@ class LaneLine:
     marking_cm: float = float("nan")
     unpainted: float = float("nan")
     contradicted_cm: Float[np.ndarray, "w 2"] = field(default_factory=_no_sections)
+    marking_at_cm: Float[np.ndarray, "v"] = field(default_factory=_none)
 
     @property
     def index(self) -> int:
@@ -129,6 +131,12 @@ class LaneLine:
             return np.full(len(s_cm), np.nan)
         return np.interp(s_cm, self.sigma_s_cm, self.sigma_at_cm, period=self.period_cm)
 
+    def widths_cm(self, s_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """Width of the marking along s; NaN if unknown."""
+        if not len(self.marking_at_cm):
+            return np.full(len(s_cm), self.marking_cm)
+        return np.interp(s_cm, self.sigma_s_cm, self.marking_at_cm, period=self.period_cm)
+
     def scaled(self, factor: float) -> LaneLine:
         """Return the line with every length multiplied by a factor."""
         return replace(
@@ -141,5 +149,6 @@ class LaneLine:
             sigma_s_cm=self.sigma_s_cm * factor,
             sigma_at_cm=self.sigma_at_cm * factor,
             marking_cm=self.marking_cm * factor,
+            marking_at_cm=self.marking_at_cm * factor,
             contradicted_cm=self.contradicted_cm * factor,
         )

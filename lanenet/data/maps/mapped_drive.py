@@ -36,8 +36,10 @@ CONTRADICTED = "the pictures disagree with the map"
 BETWEEN_LANES = "on the line between two lanes, or in a swerve beyond it"
 #: A wrong map puts the car there, too; so these frames count against the map.
 AWAY = "far beside the lane"
+#: Of a wide lane or a tight bend, where the images agree with the map.
+OUTSIDE = "both lines beside the window"
 #: Frames that a complete map would not label either.
-NOT_TO_LABEL = (DELETED, BETWEEN_LANES)
+NOT_TO_LABEL = (DELETED, BETWEEN_LANES, OUTSIDE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +203,9 @@ def label_frames(mapped: MappedDrive, window: BirdseyeWindow) -> MapLabels:
             lines[k], points_cm[k] = labelled
         if reasons[k] not in NOT_TO_LABEL:
             in_window[k] = points_in_window(mapped.drive_map, k, window)
+        # A wrong map puts lines there, too, but images around the frame contradict it.
+        if reasons[k] == NO_LINE and not (in_window[k].any() or mapped.drive_map.contradicted[k].any()):
+            reasons[k] = OUTSIDE
     return MapLabels(reasons, lines, points_cm, in_window)
 
 

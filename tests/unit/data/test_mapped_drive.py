@@ -26,9 +26,13 @@ from lanenet.data.maps.mapped_drive import (
     BETWEEN_LANES,
     CONTRADICTED,
     DELETED,
+    NO_LINE,
+    NOT_TO_LABEL,
+    OUTSIDE,
     UNCERTAIN,
     known_lines,
     label_frame,
+    label_frames,
     labelled_points,
     lines_at,
     open_mapped_drive,
@@ -205,6 +209,14 @@ def test_why_a_frame_gets_no_labels(folder):
     # Frame 16 of the drive is the 12th of the map.
     assert label_frame(replace(mapped, drive=deleted), 12, window) == DELETED
     assert not isinstance(label_frame(replace(mapped, drive=deleted), 13, window), str)
+
+
+def test_lines_beside_the_window_count_against_a_map_only_where_images_contradict_it(folder):
+    mapped, window = open_mapped_drive(folder), BirdseyeWindow(left_cm=100.0)
+    assert label_frames(mapped, window).reasons[3] == OUTSIDE
+    assert OUTSIDE in NOT_TO_LABEL
+    contradicting = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [3, -1])
+    assert label_frames(replace(mapped, drive_map=contradicting), window).reasons[3] == NO_LINE
 
 
 def test_a_frame_without_edges_is_uncertain_unless_it_is_the_first(folder):

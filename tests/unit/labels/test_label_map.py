@@ -30,7 +30,8 @@ def _borders(x_cm: float, shift_cm: float = 0.0) -> np.ndarray:
 
 
 def _lane(left: np.ndarray, right: np.ndarray, *markings_cm: float) -> FrameLines:
-    return FrameLines(left, right, np.full(6, np.nan), markings_cm or (np.nan, np.nan))
+    widths_cm = tuple(np.full(len(left), width_cm) for width_cm in markings_cm)
+    return FrameLines(left, right, np.full(6, np.nan), widths_cm or None)
 
 
 LINES = _lane(_line(-20.0), _line(20.0))

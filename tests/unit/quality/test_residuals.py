@@ -13,6 +13,7 @@ from datagen.quality.residuals import (
     BorderSamples,
     border_samples,
     join_samples,
+    reference_scale,
     summarise,
 )
 from lanenet.data.maps.frame_lines import FrameLines
@@ -129,13 +130,28 @@ def test_figures_of_known_residuals():
     assert figures.samples == 5 and figures.coverage == pytest.approx(0.8)
     assert figures.robust_sd_px == pytest.approx(1.4826 * 0.75) and figures.median_px == pytest.approx(0.25)
     assert figures.p95_px == pytest.approx(1.85)
-    wide = figures.as_dict(320)
+    wide = figures.as_dict(0.5)
     assert wide["p95_px_at_160"] == pytest.approx(0.5 * figures.p95_px)
     assert np.isnan(summarise(join_samples([])).coverage)
 
 
+def test_a_camera_close_to_the_road_is_not_held_to_fractions_of_a_millimetre():
+    assert reference_scale(CAMERA) == 1.0
+    wide = replace(CAMERA, width=320, height=240, K=CAMERA.K * [[2.0], [2.0], [1.0]])
+    assert reference_scale(wide) == pytest.approx(0.5)
+    # Several times as near to what lies 45 cm ahead.
+    near = CAMERA.with_mounting(height_cm=8.0, ahead_of_front_axle_cm=36.0, pitch_down_rad=0.9)
+    left, right = near.project_ground(np.array([[-0.5, 45.0], [0.5, 45.0]]))
+    assert reference_scale(near) == pytest.approx(1.0 / (0.45 * (right - left)[0]), rel=0.02)
+    assert reference_scale(near) < 0.5
+    # That place is behind it.
+    ahead = CAMERA.with_mounting(ahead_of_front_axle_cm=80.0)
+    assert reference_scale(ahead) == reference_scale(CAMERA.with_mounting(ahead_of_front_axle_cm=40.0))
+
+
 def test_a_line_that_knows_its_marking_is_compared_with_that():
-    wide = replace(lane(), markings_cm=(TAPE_CM + 1.5, float("nan")))
+    unknown = np.full(len(lane().left_cm), np.nan)
+    wide = replace(lane(), widths_cm=(np.full_like(unknown, TAPE_CM + 1.5), unknown))
     assert abs(summarise(measure(edges_of(lane()), lane())).median_px) < 0.05
     found = measure(edges_of(lane()), wide)
     assert summarise(found.select(~found.right)).median_px > 0.3

@@ -54,6 +54,12 @@ def test_sections_that_are_withheld_are_said_first():
     assert graded(GOOD, withheld=withheld, withheld_share=0.9).grade == "reject"
 
 
+def test_tape_that_is_wider_in_places_is_named():
+    (told,) = [remark for remark in graded(GOOD, tape_range_cm=(3.4, 5.2)).remarks if "5.2 cm" in remark]
+    assert "3.4 cm" in told and "not flat" in told
+    assert graded(GOOD, tape_range_cm=(3.4, 5.2)).grade == "good"
+
+
 def test_what_sets_the_scale_is_named_with_what_follows_from_it():
     remarks = graded(GOOD, height_cm=17.2, tape_cm=1.9).remarks
     assert any("17.2 cm" in remark and "1.9 cm" in remark for remark in remarks)
