@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from dataclasses import replace
 
@@ -94,6 +95,26 @@ def test_a_line_goes_through_the_corners_of_its_tape(angle_deg):
     # Elsewhere it is what it was.
     away = np.array([10.0, 80.0, 240.0, 400.0, 560.0])
     np.testing.assert_allclose(found.everywhere(away), line.everywhere(away), atol=0.05)
+
+
+def test_a_short_piece_of_clutter_does_not_lead_a_line_away():
+    # Dashes, and the edge of something beside one of them, three quarters of the height long.
+    course = np.array([[0.0, 0.0], [4.0 * SIDE_CM, 0.0]])
+    tape = _borders(course)
+    dashes = tape.select(np.mod(tape.xy_cm[:, 0], 40.0) < 22.0)
+    angle = np.deg2rad(58.0)
+    way = np.array([[300.0, 0.0], [300.0 + 14.0 * np.cos(angle), 14.0 * np.sin(angle)]])
+    clutter = _borders(way, seed=1)
+    edges = MapEdges(
+        *(
+            np.concatenate([getattr(one, item.name) for one in (dashes, clutter)])
+            for item in dataclasses.fields(MapEdges)
+        )
+    )
+    line = _smooth(course)
+    found = with_kinks(line, edges, HEIGHT_CM, LANE_CM)
+    s_cm = np.arange(20.0, 4.0 * SIDE_CM - 20.0, 0.5)
+    assert np.abs(found.everywhere(s_cm)[:, 1]).max() < 1.0
 
 
 def test_a_corner_at_the_seam_of_a_lap_is_found():
