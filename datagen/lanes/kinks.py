@@ -134,7 +134,8 @@ class _Section:
         margin_cm = _BLEND * height_cm
         s_cm = np.arange(self.s_cm[0] - margin_cm, self.s_cm[-1] + margin_cm, 0.5 * _STRAYED * height_cm)
         wanted = cKDTree(self.blended(s_cm, line.everywhere(s_cm)))
-        return bool(wanted.query(found.everywhere(s_cm))[0].max() > _STRAYED * height_cm)
+        apart_cm = np.asarray(wanted.query(found.everywhere(s_cm))[0])
+        return bool(apart_cm.max() > _STRAYED * height_cm)
 
     def blended(
         self, s_cm: Float[np.ndarray, "m"], line_cm: Float[np.ndarray, "m 2"]

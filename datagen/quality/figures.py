@@ -218,6 +218,8 @@ def map_evidence(
         height_given=bool(figures.get("calibration", {}).get("height_given")),
         given_height_cm=figures["given"]["camera_height_cm"],
         given_tape_cm=figures["given"]["tape_width_cm"],
+        in_view=figures["labelled"].get("in_view", float("nan")),
+        ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
         segments=len(figures["segments_mapped"]),

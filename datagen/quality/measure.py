@@ -35,7 +35,8 @@ from lanenet.data.maps.mapped_drive import (
     lines_at,
 )
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import SIDES
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import ROWS_CM, SIDES
 
 #: Status of a frame, beside the reasons of :mod:`lanenet.data.maps.mapped_drive`; reports use these as keys.
 NOT_MAPPED, LABELLED = "segment not mapped", "labelled"
@@ -60,6 +61,7 @@ class MapQuality:
         in_window: Which points a complete map would label; none for frames that are not to be labelled.
         wrong: Sections of the lines that are withheld, the longest first.
         scale: Reference pixels per pixel, see :func:`datagen.quality.residuals.reference_scale`.
+        in_view: Share of the labels whose places lie in the image; NaN without labels.
     """
 
     held_out: Int[np.ndarray, "h"]
@@ -70,6 +72,7 @@ class MapQuality:
     in_window: Bool[np.ndarray, "n 6"]
     wrong: tuple[WrongPlace, ...] = ()
     scale: float = 1.0
+    in_view: float = float("nan")
 
     @property
     def near(self) -> BorderSamples:
@@ -122,7 +125,20 @@ def measure_map(mapped: MappedDrive) -> MapQuality:
         status[row] = reason or LABELLED
     scale = reference_scale(drive_map.camera)
     points_cm, in_window = labels.points_cm, labels.in_window
-    return MapQuality(rows, samples, join_samples(chance), status, points_cm, in_window, scale=scale)
+    seen = share_in_view(drive_map.camera, points_cm)
+    return MapQuality(
+        rows, samples, join_samples(chance), status, points_cm, in_window, scale=scale, in_view=seen
+    )
+
+
+def share_in_view(camera: Camera, points_cm: Float[np.ndarray, "n 6"]) -> float:
+    """Share of labelled points that lie in a camera's image; NaN without any."""
+    ahead_cm = np.broadcast_to(np.tile(ROWS_CM, len(SIDES)), points_cm.shape)
+    places = np.stack([points_cm, ahead_cm], axis=-1)[np.isfinite(points_cm)]
+    uv = camera.project_ground(places)
+    inside = np.isfinite(uv).all(axis=1) & (uv >= 0.0).all(axis=1)
+    inside &= (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    return float(inside.mean()) if len(inside) else float("nan")
 
 
 def quality_figures(quality: MapQuality) -> dict[str, Any]:
@@ -162,6 +178,7 @@ def quality_figures(quality: MapQuality) -> dict[str, Any]:
             "share_of_all_frames": quality.status.count(LABELLED) / max(len(quality.status), 1),
             "why_not": quality.not_labelled,
             "points_in_window": quality.point_shares,
+            "in_view": quality.in_view,
             "points_share": np.isfinite(quality.points_cm).mean(axis=0).tolist(),
         },
     }

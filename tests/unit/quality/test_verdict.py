@@ -54,6 +54,13 @@ def test_sections_that_are_withheld_are_said_first():
     assert graded(GOOD, withheld=withheld, withheld_share=0.9).grade == "reject"
 
 
+def test_a_camera_that_does_not_see_what_is_labelled_is_named():
+    verdict = graded(GOOD, in_view=0.04, ahead_cm=27.5)
+    assert verdict.grade == "usable"
+    assert "4 % of the places" in verdict.sentence and "--wheelbase" in verdict.sentence
+    assert graded(GOOD, in_view=0.6).grade == "good"
+
+
 def test_tape_that_is_wider_in_places_is_named():
     (told,) = [remark for remark in graded(GOOD, tape_range_cm=(3.4, 5.2)).remarks if "5.2 cm" in remark]
     assert "3.4 cm" in told and "not flat" in told
