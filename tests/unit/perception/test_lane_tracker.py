@@ -184,6 +184,27 @@ def test_two_lanes_for_which_equally_much_speaks_are_none():
     np.testing.assert_allclose(points_cm, lines[3:], atol=0.2)
 
 
+def test_the_lane_that_a_car_may_have_left_is_followed_until_one_of_the_two_is_plain():
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for line_cm in (8.0, 4.0, 0.9):
+        lane = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        points_cm, _, _ = tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    np.testing.assert_allclose(points_cm, lane, atol=0.2)
+    # Beyond its outer line is bare floor. The network takes that for a lane.
+    for line_cm in (-6.0, -11.0, -14.0, -14.0, -11.0, -6.0):
+        lane = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        edges = edges_of(lane)
+        # The lane's left line passes out of view.
+        shown = edges.rows()[(edges.points_cm[:, 0] > line_cm - 10.0) | (edges.points_cm[:, 1] < 20.0)]
+        takes = lane + LANE_CM
+        points_cm, _, _ = tracker.follow(takes, SURE, np.array([1.0, 0.4]), RoadEdges.of_rows(shown))
+        assert np.isnan(points_cm).all()
+    for line_cm in (4.0, 8.0):
+        lane = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        points_cm, _, _ = tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    np.testing.assert_allclose(points_cm, lane, atol=0.2)
+
+
 def test_a_line_that_the_network_has_elsewhere_is_not_answered():
     tracker = LaneTracker(LaneMemory(LANE_CM))
     for _ in range(3):
