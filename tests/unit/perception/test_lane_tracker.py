@@ -157,16 +157,39 @@ def test_a_line_that_nothing_tells_of_is_not_answered():
 
 
 @pytest.mark.parametrize(
-    ("x_cm", "sides", "answered"),
-    [(0.9, (1,), False), (9.0, (1,), True), (0.9, (0, 1), True), (0.5, (0, 1), False)],
+    ("x_cm", "sides", "answered"), [(0.9, (1,), True), (0.5, (1,), False), (0.5, (0, 1), False)]
 )
-def test_a_car_on_a_line_is_in_a_lane_that_nobody_knows_within_sigma_if_that_alone_is_seen(
-    x_cm, sides, answered
-):
+def test_a_car_on_a_line_is_in_a_lane_that_nobody_knows(x_cm, sides, answered):
     tracker = LaneTracker(LaneMemory(LANE_CM))
     lines = np.repeat([x_cm - LANE_CM, x_cm], 3)
     for _ in range(3):
         points_cm, _, _ = tracker.follow(lines, SURE, SEEN, edges_of(lines, sides=sides))
+    assert np.isfinite(points_cm).all() == answered
+
+
+@pytest.mark.parametrize(
+    ("x_cm", "presence", "answered"), [(-9.0, 0.4, False), (-9.0, 0.6, True), (-11.0, 0.4, True)]
+)
+def test_beside_a_line_that_the_network_does_not_see_nothing_is_answered(x_cm, presence, answered):
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    lines = np.repeat([x_cm, x_cm + LANE_CM], 3)
+    points_cm, _, _ = tracker.follow(lines, SURE, np.array([presence, 1.0]), edges_of(lines))
+    assert np.isfinite(points_cm).all() == answered
+
+
+@pytest.mark.parametrize(
+    ("x_cm", "sides", "answered"), [(-9.0, (0,), False), (-9.0, (0, 1), True), (-11.0, (0,), True)]
+)
+def test_beside_a_crossed_line_the_next_lane_counts_once_its_other_line_is_seen(x_cm, sides, answered):
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for line_cm in (8.0, 4.0):
+        before = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        tracker.follow(before, SURE, SEEN, edges_of(before))
+    # The line of the lane that was left is out of view.
+    for line_cm in (-4.0, x_cm):
+        lines = np.repeat([line_cm, line_cm + LANE_CM], 3)
+        presence = np.array([1.0, float(1 in sides)])
+        points_cm, _, _ = tracker.follow(lines, SURE, presence, edges_of(lines, sides=sides))
     assert np.isfinite(points_cm).all() == answered
 
 
