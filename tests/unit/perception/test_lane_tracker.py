@@ -157,16 +157,39 @@ def test_a_line_that_nothing_tells_of_is_not_answered():
 
 
 @pytest.mark.parametrize(
-    ("x_cm", "sides", "answered"),
-    [(0.9, (1,), False), (9.0, (1,), True), (0.9, (0, 1), True), (0.5, (0, 1), False)],
+    ("x_cm", "sides", "answered"), [(0.9, (1,), True), (0.5, (1,), False), (0.5, (0, 1), False)]
 )
-def test_a_car_on_a_line_is_in_a_lane_that_nobody_knows_within_sigma_if_that_alone_is_seen(
-    x_cm, sides, answered
-):
+def test_a_car_on_a_line_is_in_a_lane_that_nobody_knows(x_cm, sides, answered):
     tracker = LaneTracker(LaneMemory(LANE_CM))
     lines = np.repeat([x_cm - LANE_CM, x_cm], 3)
     for _ in range(3):
         points_cm, _, _ = tracker.follow(lines, SURE, SEEN, edges_of(lines, sides=sides))
+    assert np.isfinite(points_cm).all() == answered
+
+
+@pytest.mark.parametrize(
+    ("x_cm", "presence", "answered"), [(-9.0, 0.4, False), (-9.0, 0.6, True), (-11.0, 0.4, True)]
+)
+def test_beside_a_line_that_the_network_does_not_see_nothing_is_answered(x_cm, presence, answered):
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    lines = np.repeat([x_cm, x_cm + LANE_CM], 3)
+    points_cm, _, _ = tracker.follow(lines, SURE, np.array([presence, 1.0]), edges_of(lines))
+    assert np.isfinite(points_cm).all() == answered
+
+
+@pytest.mark.parametrize(
+    ("x_cm", "sides", "answered"), [(-9.0, (0,), False), (-9.0, (0, 1), True), (-11.0, (0,), True)]
+)
+def test_beside_a_crossed_line_the_next_lane_counts_once_its_other_line_is_seen(x_cm, sides, answered):
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for line_cm in (8.0, 4.0):
+        before = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        tracker.follow(before, SURE, SEEN, edges_of(before))
+    # The line of the lane that was left is out of view.
+    for line_cm in (-4.0, x_cm):
+        lines = np.repeat([line_cm, line_cm + LANE_CM], 3)
+        presence = np.array([1.0, float(1 in sides)])
+        points_cm, _, _ = tracker.follow(lines, SURE, presence, edges_of(lines, sides=sides))
     assert np.isfinite(points_cm).all() == answered
 
 
@@ -182,6 +205,27 @@ def test_two_lanes_for_which_equally_much_speaks_are_none():
     assert np.isnan(points_cm).all()
     points_cm, _, _ = tracker.follow(lines[3:], SURE, SEEN, edges)
     np.testing.assert_allclose(points_cm, lines[3:], atol=0.2)
+
+
+def test_the_lane_that_a_car_may_have_left_is_followed_until_one_of_the_two_is_plain():
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for line_cm in (8.0, 4.0, 0.9):
+        lane = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        points_cm, _, _ = tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    np.testing.assert_allclose(points_cm, lane, atol=0.2)
+    # Beyond its outer line is bare floor. The network takes that for a lane.
+    for line_cm in (-6.0, -11.0, -14.0, -14.0, -11.0, -6.0):
+        lane = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        edges = edges_of(lane)
+        # The lane's left line passes out of view.
+        shown = edges.rows()[(edges.points_cm[:, 0] > line_cm - 10.0) | (edges.points_cm[:, 1] < 20.0)]
+        takes = lane + LANE_CM
+        points_cm, _, _ = tracker.follow(takes, SURE, np.array([1.0, 0.4]), RoadEdges.of_rows(shown))
+        assert np.isnan(points_cm).all()
+    for line_cm in (4.0, 8.0):
+        lane = np.repeat([line_cm - LANE_CM, line_cm], 3)
+        points_cm, _, _ = tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    np.testing.assert_allclose(points_cm, lane, atol=0.2)
 
 
 def test_a_line_that_the_network_has_elsewhere_is_not_answered():
