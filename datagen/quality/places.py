@@ -68,6 +68,8 @@ _OTHER, _OTHER_PLACES = 0.25, 30
 #: Shortest section that is wrong, and how far apart sections are joined where the line is not met in between,
 #: in places. Chosen: 10 cm, and 40 cm, twice the usual gap between dashes.
 _SHORTEST, _JOINED = 5, 20
+#: Shortest one beside a gap without paint, in which the line is off, too. Chosen: a third of a dash.
+_SHORTEST_AT_GAP = 3
 #: Longest section without paint: in lane widths, or relative to the usual gap of a line that has at least so
 #: many. Chosen: interruptions shorter than the lane is wide are bridged well.
 _BARE_LANES, _BARE_GAPS, _MIN_GAPS = 2.5, 1.5, 4
@@ -318,7 +320,8 @@ def wrong_places(
     found = [
         run
         for run in _joined(wrong, ~confirmed, closed)
-        if len(run) >= _SHORTEST and not abs(_distance_cm(beside[:, run])) > len(run) * _PLACE_CM
+        if len(run) >= (_SHORTEST_AT_GAP if _ends_at_gap(run, confirmed, closed) else _SHORTEST)
+        and not abs(_distance_cm(beside[:, run])) > len(run) * _PLACE_CM
     ]
     if other is not None and len(other.met) == len(empty):
         hidden = _hidden_corners(empty | _unpainted(evidence, closed), other, closed)
@@ -479,6 +482,15 @@ def _joined(
             inner = closed or (run[0] > 0 and run[-1] < len(mask) - 1)
             joined[run] = inner
     return list(true_runs(joined, closed))
+
+
+def _ends_at_gap(run: Int[np.ndarray, "r"], confirmed: Bool[np.ndarray, "p"], closed: bool) -> bool:
+    """Whether the line is not met over the places before a run, or behind it: there it is off as well."""
+    before = np.arange(run[0] - _SHORTEST, run[0])
+    behind = np.arange(run[-1] + 1, run[-1] + 1 + _SHORTEST)
+    n = len(confirmed)
+    sides = [side for side in (before, behind) if closed or (side[0] >= 0 and side[-1] < n)]
+    return any(not confirmed[side % n].any() for side in sides)
 
 
 def _too_long(empty: Bool[np.ndarray, "p"], lane_cm: float, closed: bool) -> list[Int[np.ndarray, "_"]]:

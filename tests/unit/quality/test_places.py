@@ -133,6 +133,21 @@ def test_a_line_beside_its_tape_is_withheld_there(monkeypatch, height_cm):
     assert figures["share"] == pytest.approx(place.length_cm / (2.0 * LENGTH_CM), abs=0.01)
 
 
+def test_a_line_that_leaves_the_end_of_a_dash_is_off_in_the_gap_behind_it(monkeypatch):
+    def leaving(s_cm: np.ndarray) -> np.ndarray:
+        return dashes(s_cm) + np.where(
+            (s_cm > 120.0) & (s_cm < 140.0), np.maximum(s_cm - 128.0, 0.0) / 4.0, 0.0
+        )
+
+    drive_map, wrong = places.withhold_wrong_places(
+        drive_of(monkeypatch, ("left", leaving), ("right", where_mapped))
+    )
+    (place,) = wrong
+    assert place.name == "left line"
+    left, _ = drive_map.lines[0]
+    assert left.contradicted(np.array([110.0, 138.0, 150.0, 210.0])).tolist() == [False, True, True, False]
+
+
 def test_the_other_tape_of_a_double_line_is_a_thing_of_its_own(monkeypatch):
     def beside(s_cm: np.ndarray) -> np.ndarray:
         return np.full(len(s_cm), 5.0)
