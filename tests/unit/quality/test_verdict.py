@@ -62,9 +62,10 @@ def test_a_camera_that_does_not_see_what_is_labelled_is_named():
 
 
 def test_tape_that_is_wider_in_places_is_named():
-    (told,) = [remark for remark in graded(GOOD, tape_range_cm=(3.4, 5.2)).remarks if "5.2 cm" in remark]
-    assert "3.4 cm" in told and "not flat" in told
-    assert graded(GOOD, tape_range_cm=(3.4, 5.2)).grade == "good"
+    verdict = graded(GOOD, tape_range_cm=(3.4, 5.2))
+    assert verdict.grade == "usable"
+    assert "3.4 cm" in verdict.sentence and "5.2 cm" in verdict.sentence and "not flat" in verdict.sentence
+    assert graded(GOOD, tape_range_cm=(4.6, 5.2)).grade == "good"
 
 
 def test_what_sets_the_scale_is_named_with_what_follows_from_it():
