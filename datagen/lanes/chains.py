@@ -54,6 +54,23 @@ class Chain:
         steps = np.linalg.norm(np.diff(self.points_cm, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
+    @property
+    def closed(self) -> bool:
+        """Whether it ends where it begins, in the middle of a piece."""
+        return len(self.points_cm) > 3 and bool(np.all(self.points_cm[0] == self.points_cm[-1]))
+
+    def begun_at(self, past_cm: float) -> Chain:
+        """The same closed chain, from another place on it."""
+        piece = int(np.searchsorted(self.lengths_cm, past_cm, side="right")) - 1
+        begin = self.at(np.array([past_cm]))
+        # Its seam is no corner.
+        points = [begin, self.points_cm[piece + 1 : -1], self.points_cm[1 : piece + 1], begin]
+        widths = self.markings_cm
+        if not 0 < piece < len(widths) - 1:
+            return replace(self, points_cm=np.concatenate([begin, self.points_cm[1:-1], begin]))
+        markings = [widths[piece:-1], widths[: piece + 1]]
+        return Chain(np.concatenate(points), np.concatenate(markings))
+
     def at(self, past_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
         """Points at distances from its beginning."""
         lengths = self.lengths_cm
@@ -139,7 +156,9 @@ class _Joiner:
                 middle = 0.5 * (home.begin_cm + home.end_cm)
                 return [middle, *points, middle], markings, others
             others = [other for other in others if not other.same(following)]
-            piece = replace(following, begin_cm=meet)
+            # What is left of it bends by so much less.
+            left = float(np.linalg.norm(following.end_cm - meet)) / following.length_cm
+            piece = replace(following, begin_cm=meet, bend_rad=left * following.bend_rad)
 
     def _meet(self, before: Piece, after: Piece) -> Float[np.ndarray, "2"] | None:
         """Where one piece goes over into another one; None where it does not."""

@@ -227,6 +227,12 @@ class _Search:
     def _off_chain(self, chain: Chain) -> Iterator[_Section]:
         """Sections where the line leaves a chain."""
         length_cm, blend = float(chain.lengths_cm[-1]), round(_BLEND / _PLACE)
+        if chain.closed:
+            # From the middle of what lies on the line, so that no section goes across its seam.
+            way_cm = np.linspace(0.0, length_cm, max(4, int(length_cm / (_PLACE * self.height_cm))))[1:-1]
+            runs = true_runs(np.asarray(self.places.query(chain.at(way_cm))[0]) <= self._step_cm, True)
+            longest = max(runs, key=len, default=np.zeros(1, np.int64))
+            chain = chain.begun_at(float(way_cm[longest[len(longest) // 2]]))
         past_cm = np.linspace(0.0, length_cm, max(2, int(length_cm / (_PLACE * self.height_cm)) + 1))
         points = chain.at(past_cm)
         apart, nearest = self.places.query(points)

@@ -36,12 +36,12 @@ def marking_widths(line: LaneLine, edges: MapEdges, camera_height_cm: float) -> 
         camera_height_cm: Sets the scale of places.
 
     Returns:
-        Widths at ``line.sigma_s_cm``, the usual one where both borders are not seen.
+        Widths at ``line.sigma_s_cm``, the usual one where both borders are not seen; none if they are seen
+        nowhere.
     """
     s_cm = line.sigma_s_cm
-    usual_cm = np.full(len(s_cm), line.marking_cm)
     if not np.isfinite(line.marking_cm) or not len(edges.xy_cm) or len(s_cm) < 2:
-        return usual_cm
+        return np.empty(0)
     at_cm, right = line.everywhere(s_cm), -left_of(line.everywhere(s_cm, 1))
     reach_cm = _FARTHEST * line.marking_cm + float(s_cm[1] - s_cm[0])
     apart_cm, nearest = cKDTree(at_cm).query(edges.xy_cm, distance_upper_bound=reach_cm)
@@ -61,10 +61,10 @@ def marking_widths(line: LaneLine, edges: MapEdges, camera_height_cm: float) -> 
     centres_cm = s_cm[0] + (np.arange(count) + 0.5) * _PLACE * camera_height_cm
     known = np.isfinite(smooth_cm)
     if not known.any():
-        return usual_cm
+        return np.empty(0)
     found = np.interp(s_cm, centres_cm[known], smooth_cm[known], period=line.period_cm)
     there = np.minimum(((s_cm - s_cm[0]) / (_PLACE * camera_height_cm)).astype(np.int64), count - 1)
-    return np.where(known[there], found, usual_cm)
+    return np.where(known[there], found, line.marking_cm)
 
 
 def _medians(

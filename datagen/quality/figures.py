@@ -215,7 +215,9 @@ def map_evidence(
         height_given=bool(figures.get("calibration", {}).get("height_given")),
         given_height_cm=figures["given"]["camera_height_cm"],
         given_tape_cm=figures["given"]["tape_width_cm"],
-        in_view=figures["labelled"].get("in_view", float("nan")),
+        outside_share=figures["labelled"]["outside_share"],
+        # Null in a report that was read back.
+        in_view=float("nan") if (seen := figures["labelled"]["in_view"]) is None else seen,
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],

@@ -29,6 +29,7 @@ from datagen.quality.residuals import (
 from lanenet.data.maps.mapped_drive import (
     DELETED,
     NOT_TO_LABEL,
+    OUTSIDE,
     MappedDrive,
     label_frames,
     labelled_points,
@@ -95,6 +96,12 @@ class MapQuality:
         """Share of frames with labels, of those that a complete map would label."""
         kept = [status for status in self.status if status not in NOT_TO_LABEL]
         return sum(status == LABELLED for status in kept) / max(len(kept), 1)
+
+    @property
+    def outside_share(self) -> float:
+        """Share of frames with both lines beside the window, of those that might have been labelled."""
+        kept = [status for status in self.status if status == OUTSIDE or status not in NOT_TO_LABEL]
+        return kept.count(OUTSIDE) / max(len(kept), 1)
 
     @property
     def point_shares(self) -> dict[str, float]:
@@ -178,6 +185,7 @@ def quality_figures(quality: MapQuality) -> dict[str, Any]:
             "share_of_all_frames": quality.status.count(LABELLED) / max(len(quality.status), 1),
             "why_not": quality.not_labelled,
             "points_in_window": quality.point_shares,
+            "outside_share": quality.outside_share,
             "in_view": quality.in_view,
             "points_share": np.isfinite(quality.points_cm).mean(axis=0).tolist(),
         },

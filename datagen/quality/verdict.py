@@ -38,6 +38,7 @@ class MapEvidence:
         p95_px: 95th percentile of both lines' absolute residuals, image 160 px wide; NaN if there are none.
         coverage: Share of both lines' borders in view that met an edge; NaN if no frame was held out.
         labelled_share: Share of frames with labels, of those that are to be labelled.
+        outside_share: Share of frames with both lines beside the window, of these and of those.
         point_shares: Share of each line's points in the window that have labels, in the same frames.
         not_labelled: Number of frames without labels, by reason.
         revisits: Number of revisits.
@@ -87,6 +88,7 @@ class MapEvidence:
     height_given: bool = False
     given_height_cm: float | None = None
     given_tape_cm: float | None = None
+    outside_share: float = 0.0
     in_view: float = float("nan")
     ahead_cm: float = 0.0
     tape_range_cm: tuple[float, float] | None = None
@@ -116,6 +118,8 @@ class VerdictSettings(Settings):
             frame's samples of a line (two borders over 45 cm).
         min_labelled: Share of frames with labels (one of six points at least), without those that the driver
             deleted. Where one line's points in the window have a smaller share, the map is usable. Chosen.
+        max_outside: Share of frames with both lines beside the window of the labels. Chosen: twice what may
+            have no labels; a map three times too large, which no residual shows, has more.
         min_in_view: Share of the labels whose places lie in the image; a map with less is usable. Measured:
             0.58 and 0.85 on two real drives, whose cameras do not see what is beside the front axle.
         min_coverage: Share of the borders in view that met an edge. Dashes and worn lines lower it; below it,
@@ -154,6 +158,7 @@ class VerdictSettings(Settings):
     max_p95_px: float = Field(default=1.5, gt=0.0)
     min_samples: int = Field(default=50, ge=1)
     min_labelled: float = Field(default=0.85, gt=0.0, lt=1.0)
+    max_outside: float = Field(default=0.3, gt=0.0, lt=1.0)
     min_in_view: float = Field(default=0.25, gt=0.0, lt=1.0)
     min_coverage: float = Field(default=0.3, gt=0.0, lt=1.0)
     max_contradicted: float = Field(default=0.075, gt=0.0, lt=1.0)
@@ -223,11 +228,16 @@ _DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
 _USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
 
 
+#: Share of frames that is worth naming.
+_TOLD = 0.02
+
+
 def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     """Grade a map."""
     # Causes before what comes of them.
     checks = (
         _uneven,
+        _outside,
         _in_view,
         _residuals,
         _labelled,
@@ -251,6 +261,8 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
         return Verdict(worst.grade, sentence, tuple(figures), remarks)
     sds = ", ".join(f"{line.robust_sd_px:.2f} px ({side} line)" for side, line in evidence.lines.items())
     labelled = f"{_percent(evidence.labelled_share)} of the frames have labels"
+    if evidence.outside_share >= _TOLD:
+        labelled += f" (not counting {_percent(evidence.outside_share)} with both lines beside the window)"
     sentence = f"the lines lie on those in the images, and {labelled}: it can be used as it is"
     if withheld:
         # A map with a wrong section is good only without that section.
@@ -429,6 +441,19 @@ def _labelled(e: MapEvidence, s: VerdictSettings) -> _Findings:
                 f"{_percent(share)} of the {side} line's points in the window {expected} (frames: "
                 f"{_percent(e.labelled_share)}; min_labelled)",
             )
+
+
+def _outside(e: MapEvidence, s: VerdictSettings) -> _Findings:
+    grade = _bounded(e.outside_share, s.max_outside, s)
+    if grade != "good":
+        share = _percent(e.outside_share)
+        yield Finding(
+            grade,
+            f"in {share} of the frames both lines of the lane lie beside the window of the labels",
+            "is the lane width right? If it is, tilt the camera, or drive a narrower lane",
+            f"both lines lie beside the window in {share} of the frames, "
+            f"{_at_most('max_outside', s.max_outside, s)}",
+        )
 
 
 def _in_view(e: MapEvidence, s: VerdictSettings) -> _Findings:

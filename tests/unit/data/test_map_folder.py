@@ -101,6 +101,24 @@ def test_closed_lines_and_lines_beside_the_lane_are_read_back(tmp_path):
     )
 
 
+def test_widths_along_a_line_are_read_back_and_older_maps_have_one(tmp_path):
+    written = _closed_map()
+    line = written.lines[0][1]
+    wider = replace(line, marking_at_cm=np.where(line.sigma_s_cm < 100.0, 3.0, 2.0))
+    written = replace(written, lines={0: [written.lines[0][0], wider, written.lines[0][2]]})
+    write_map(tmp_path, written, {"frame": np.arange(2)}, {}, "given")
+    at = np.array([50.0, 200.0])
+    assert [line.widths_cm(at).tolist() for line in read_map(tmp_path).lines[0][:2]] == [
+        [2.0, 2.0],
+        [3.0, 2.0],
+    ]
+    lanes = json.loads((tmp_path / "lanes.json").read_text())
+    for item in lanes["lines"]:
+        del item["marking_at_cm"]
+    (tmp_path / "lanes.json").write_text(json.dumps(lanes))
+    assert read_map(tmp_path).lines[0][1].widths_cm(at).tolist() == [2.0, 2.0]
+
+
 def test_sections_that_images_contradict_are_read_back_and_older_maps_have_none(tmp_path):
     written = _closed_map()
     wrong = replace(written.lines[0][1], contradicted_cm=np.array([[280.0, 320.0]]))
@@ -297,6 +315,10 @@ def _damage(plain: dict, what: str) -> object:
         line["rank"] = 10**12
     elif what == "a segment that is no number":
         line["segment"] = float("inf")
+    elif what == "widths of another number":
+        line["marking_at_cm"] = [2.0]
+    elif what == "a width of nothing":
+        line |= {"sigma_s_cm": [0.0, 1.0], "sigma_at_cm": [0.1, 0.1], "marking_at_cm": [0.0, 2.0]}
     elif what == "an unpainted share above one":
         line["bare_share"] = 7.0
     return plain
@@ -322,6 +344,8 @@ def _damage(plain: dict, what: str) -> object:
         "negative rank",
         "another period",
         "half an uncertainty",
+        "widths of another number",
+        "a width of nothing",
         "one line",
         "sides swapped",
         "equal knots",

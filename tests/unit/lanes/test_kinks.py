@@ -97,6 +97,28 @@ def test_a_line_goes_through_the_corners_of_its_tape(angle_deg):
     np.testing.assert_allclose(found.everywhere(away), line.everywhere(away), atol=0.05)
 
 
+@pytest.mark.parametrize("half_cm", [15.0, 30.0, 60.0])
+@pytest.mark.parametrize("past_cm", [0.0, 40.0])
+def test_a_line_goes_back_to_its_tape_wherever_the_chain_of_pieces_begins(half_cm, past_cm):
+    # The chain of a closed course begins in the middle of a side.
+    course = _square()
+    line = _smooth(course, closed=True)
+    period_cm = float(line.period_cm or 0.0)
+    s_cm = np.linspace(0.0, period_cm, 2000, endpoint=False)
+    for middle_cm in 0.5 * SIDE_CM + SIDE_CM * np.arange(4):
+        aside_cm = np.mod(s_cm - middle_cm - past_cm + 0.5 * period_cm, period_cm) - 0.5 * period_cm
+        hump_cm = 4.0 * (1.0 + np.cos(np.pi * np.clip(aside_cm / half_cm, -1.0, 1.0)))
+        ahead = line.everywhere(s_cm, 1)
+        left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.hypot(*ahead.T)[:, None]
+        basis = CubicBasis(line.knots_cm[3:-3], True)
+        moved = basis.fitted(s_cm, line.everywhere(s_cm) + hump_cm[:, None] * left)
+        wrong = replace(line, coefficients_cm=basis.unfolded(moved))
+        assert _off_cm(wrong, course) > 6.0
+        found = with_kinks(wrong, _borders(course), HEIGHT_CM, LANE_CM)
+        assert _off_cm(found, course) < 0.5
+        assert len(found.kinks_cm) == 4
+
+
 def test_a_short_piece_of_clutter_does_not_lead_a_line_away():
     # Dashes, and the edge of something beside one of them, three quarters of the height long.
     course = np.array([[0.0, 0.0], [4.0 * SIDE_CM, 0.0]])

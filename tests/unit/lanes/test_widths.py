@@ -59,11 +59,12 @@ def test_what_shows_one_border_only_has_the_usual_width():
     rng = np.random.default_rng(2)
     s_cm = rng.uniform(0.0, LAP_CM, 12_000)
     line = _ring()
-    np.testing.assert_array_equal(
-        marking_widths(line, _edges(np.full(len(s_cm), 5.5), s_cm, rng, right=False), HEIGHT_CM), TAPE_CM
-    )
+    one_border = _edges(np.full(len(s_cm), 5.5), s_cm, rng, right=False)
     nothing = _edges(np.empty(0), np.empty(0), rng)
-    np.testing.assert_array_equal(marking_widths(line, nothing, HEIGHT_CM), TAPE_CM)
+    for edges in (one_border, nothing):
+        found = replace(line, marking_at_cm=marking_widths(line, edges, HEIGHT_CM))
+        np.testing.assert_array_equal(found.widths_cm(np.array([0.0, 50.0])), TAPE_CM)
+    assert not len(marking_widths(replace(line, marking_cm=np.nan), one_border, HEIGHT_CM))
 
 
 def test_a_line_tells_its_width_along_itself_and_keeps_it_in_another_scale():

@@ -61,6 +61,14 @@ def test_a_camera_that_does_not_see_what_is_labelled_is_named():
     assert graded(GOOD, in_view=0.6).grade == "good"
 
 
+def test_lines_beside_the_window_are_no_labels():
+    few = graded(GOOD, outside_share=0.1)
+    assert few.grade == "good" and "10 % with both lines beside the window" in few.sentence
+    assert graded(GOOD, outside_share=0.45).grade == "usable"
+    verdict = graded(GOOD, outside_share=0.72)
+    assert verdict.grade == "reject" and "lane width" in verdict.sentence
+
+
 def test_tape_that_is_wider_in_places_is_named():
     verdict = graded(GOOD, tape_range_cm=(3.4, 5.2))
     assert verdict.grade == "usable"
