@@ -7,7 +7,7 @@ leaves such a chain, and the borders of the marking lie along the chain, the lin
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from datagen.lanes.chains import Chain, chains_of
-from datagen.lanes.offset import CubicBasis
 from datagen.lanes.path import MapEdges, left_of
+from datagen.lanes.sections import BLEND, Section, in_lap, span_cm, through
 from datagen.lanes.tape import Piece, straight_pieces
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.segments import true_runs
@@ -40,9 +40,6 @@ _MIN_COSINE = 0.64
 _BESIDE_LANES = 0.35
 #: Least cosine between a piece and the line for its direction to be known: 60 degrees.
 _ALONG = 0.5
-#: Length over which the line goes over to a chain, and of agreement within which it does not go back, in
-#: camera heights. Chosen: as long as the shortest piece.
-_BLEND = 0.6
 #: Distance of a chain's end from the line that goes back there, from which its last piece has to be so long,
 #: in camera heights. Derived: over twice that distance the line turns by 27 degrees. Measured: a piece of
 #: clutter that led away was 0.8 long, pieces of tape whose next piece was not in view 1.8 and more.
@@ -53,14 +50,6 @@ _ON_SECTION, _BETTER = 0.7, 0.3
 #: Bounds of a section's length along the line relative to that along the chain. Chosen: a corner of 120
 #: degrees that is cut is half as long; a line that does not go back and forth is not longer.
 _LENGTHS = (0.3, 2.0)
-#: Shortest cubic beside a corner, in camera heights. Chosen: as where bends are tight, or shorter.
-_LEAST_CUBIC = 0.2
-#: Distance from its pieces and the fitted line, in camera heights, from which a line that was put together
-#: anew has strayed: its cubics may swing between knots that are close together. Measured: good ones keep
-#: below 0.15, one that swung out by 10 cm had 0.6.
-_STRAYED = 0.2
-#: Samples per cubic with which a line is put together.
-_SAMPLES = 8
 
 
 def with_kinks(line: LaneLine, edges: MapEdges, camera_height_cm: float, lane_cm: float) -> LaneLine:
@@ -75,75 +64,17 @@ def with_kinks(line: LaneLine, edges: MapEdges, camera_height_cm: float, lane_cm
     if not np.isfinite(line.marking_cm) or not len(edges.xy_cm):
         return line
     search = _Search(line, edges, camera_height_cm, lane_cm)
-    sections: list[_Section] = []
+    sections: list[Section] = []
     for section in sorted(search.sections(), key=lambda section: -section.better):
         if not any(section.overlaps(other, line.period_cm) for other in sections):
             sections.append(section)
     while sections:
-        found = _through(line, sections, camera_height_cm)
+        found = through(line, sections, camera_height_cm)
         kept = [section for section in sections if not section.strayed(found, line, camera_height_cm)]
         if len(kept) == len(sections):
             return found
         sections = kept
     return line
-
-
-@dataclass(frozen=True)
-class _Section:
-    """Straight pieces that take the place of a line from one position along it to another.
-
-    Attributes:
-        s_cm: Positions where the pieces begin, where they are fully taken, of their corners, and likewise to
-            their end; the first lies within the lap.
-        points_cm: Points at these positions, frame map.
-        better: Number of places that lie on the marking, compared with the fitted line.
-    """
-
-    s_cm: Float[np.ndarray, "k"]
-    points_cm: Float[np.ndarray, "k 2"]
-    better: int
-
-    @property
-    def corners_cm(self) -> Float[np.ndarray, "c"]:
-        """Positions of its corners."""
-        return self.s_cm[2:-2]
-
-    def past(self, s_cm: Float[np.ndarray, "m"], period_cm: float | None) -> Float[np.ndarray, "m"]:
-        """Distance of positions from its beginning; on a lap, up to the next time round."""
-        past = s_cm - self.s_cm[0]
-        return past if period_cm is None else np.mod(past, period_cm)
-
-    def beside_seam(self, low_cm: float, period_cm: float | None, apart_cm: float) -> _Section:
-        """The same with its corners no nearer to the seam of a lap, where knots are simple."""
-        if period_cm is None:
-            return self
-        off = np.mod(self.corners_cm - low_cm + 0.5 * period_cm, period_cm) - 0.5 * period_cm
-        moved = np.where(np.abs(off) < apart_cm, np.copysign(apart_cm, off) - off, 0.0)
-        return replace(self, s_cm=np.concatenate([self.s_cm[:2], self.corners_cm + moved, self.s_cm[-2:]]))
-
-    def overlaps(self, other: _Section, period_cm: float | None) -> bool:
-        """Whether both take the place of the same part of a line."""
-        starts = [one.past(two.s_cm[:1], period_cm)[0] for one, two in ((self, other), (other, self))]
-        lengths = [one.s_cm[-1] - one.s_cm[0] for one in (self, other)]
-        return any(0.0 <= start <= length for start, length in zip(starts, lengths, strict=True))
-
-    def strayed(self, found: LaneLine, line: LaneLine, height_cm: float) -> bool:
-        """Whether a line that was put together anew is not where the pieces and the fitted line have it."""
-        if (np.diff(self.s_cm) <= 0.0).any():
-            return True
-        margin_cm = _BLEND * height_cm
-        s_cm = np.arange(self.s_cm[0] - margin_cm, self.s_cm[-1] + margin_cm, 0.5 * _STRAYED * height_cm)
-        wanted = cKDTree(self.blended(s_cm, line.everywhere(s_cm)))
-        apart_cm = np.asarray(wanted.query(found.everywhere(s_cm))[0])
-        return bool(apart_cm.max() > _STRAYED * height_cm)
-
-    def blended(
-        self, s_cm: Float[np.ndarray, "m"], line_cm: Float[np.ndarray, "m 2"]
-    ) -> Float[np.ndarray, "m 2"]:
-        """Points of the line with the pieces, at positions from its beginning on."""
-        pieces = np.stack([np.interp(s_cm, self.s_cm, self.points_cm[:, i]) for i in range(2)], axis=1)
-        share = np.interp(s_cm, self.s_cm[[0, 1, -2, -1]], [0.0, 1.0, 1.0, 0.0])[:, None]
-        return line_cm + share * (pieces - line_cm)
 
 
 @dataclass(frozen=True)
@@ -166,7 +97,7 @@ class _Search:
     @cached_property
     def s_cm(self) -> Float[np.ndarray, "p"]:
         """Positions of the places."""
-        low, high = _span_cm(self.line)
+        low, high = span_cm(self.line)
         count = max(1, int((high - low) / (_PLACE * self.height_cm)))
         return low + np.arange(count) * (high - low) / count
 
@@ -213,7 +144,7 @@ class _Search:
         beside = np.asarray(apart_cm) < reach_cm
         return straight_pieces(self.edges.select(beside), self.line.marking_cm, self.height_cm)
 
-    def sections(self) -> Iterator[_Section]:
+    def sections(self) -> Iterator[Section]:
         """Sections where the line leaves a chain of pieces on which the marking lies."""
         for chain in chains_of(self.pieces(), self._ahead, self._on_piece, self.height_cm):
             yield from self._off_chain(chain)
@@ -224,9 +155,9 @@ class _Search:
         along = float(left_of(self.right[place][None])[0] @ piece.along)
         return None if abs(along) < _ALONG else along > 0.0
 
-    def _off_chain(self, chain: Chain) -> Iterator[_Section]:
+    def _off_chain(self, chain: Chain) -> Iterator[Section]:
         """Sections where the line leaves a chain."""
-        length_cm, blend = float(chain.lengths_cm[-1]), round(_BLEND / _PLACE)
+        length_cm, blend = float(chain.lengths_cm[-1]), round(BLEND / _PLACE)
         if chain.closed:
             # From the middle of what lies on the line, so that no section goes across its seam.
             way_cm = np.linspace(0.0, length_cm, max(4, int(length_cm / (_PLACE * self.height_cm))))[1:-1]
@@ -258,7 +189,7 @@ class _Search:
         past_cm: Float[np.ndarray, "m"],
         place: Int[np.ndarray, "m"],
         rows: tuple[int, int, int, int],
-    ) -> _Section | None:
+    ) -> Section | None:
         """The section of a chain between samples of it; None where the marking does not lie on it.
 
         Args:
@@ -286,14 +217,14 @@ class _Search:
         way_cm = np.concatenate([[from_cm, taken_cm], corners_cm, [left_cm, to_cm]])
         s_cm, points = s_from + stretch * (way_cm - from_cm), chain.at(way_cm)
         # Beyond the end of a chain the line comes from where it was, or goes back there.
-        blend_cm = _BLEND * self.height_cm
+        blend_cm = BLEND * self.height_cm
         if rows[0] < 0:
             s_cm = np.concatenate([[s_cm[0] - blend_cm, s_cm[0]], s_cm[2:]])
             points = np.concatenate([self.line.everywhere(s_cm[:1]), chain.at(np.zeros(1)), points[2:]])
         if rows[3] >= len(past_cm):
             s_cm = np.concatenate([s_cm[:-2], [s_cm[-1], s_cm[-1] + blend_cm]])
             points = np.concatenate([points[:-2], points[-1:], self.line.everywhere(s_cm[-1:])])
-        low, high = _span_cm(self.line)
+        low, high = span_cm(self.line)
         if not self.closed and (s_cm[0] < low or s_cm[-1] > high):
             return None
         aside_cm = np.hypot(*(points[[1, -2]] - self.line.everywhere(s_cm[[1, -2]])).T)
@@ -306,8 +237,8 @@ class _Search:
         better = int((off_cm <= _ON * self.height_cm).sum() - len(off_cm) + (~on).sum())
         if (off_cm <= self._tape_cm).mean() < _ON_SECTION or better * _PLACE < _BETTER:
             return None
-        begin = _in_lap(float(s_cm[0]), low, self.line.period_cm)
-        return _Section(s_cm - s_cm[0] + begin, points, better)
+        begin = in_lap(float(s_cm[0]), low, self.line.period_cm)
+        return Section(s_cm - s_cm[0] + begin, points, better)
 
     @property
     def _step_cm(self) -> float:
@@ -345,55 +276,3 @@ class _Search:
     @property
     def _tape_cm(self) -> float:
         return max(_ON * self.height_cm, _ON_TAPE * self.line.marking_cm)
-
-
-def _span_cm(line: LaneLine) -> tuple[float, float]:
-    return float(line.knots_cm[3]), float(line.knots_cm[-4])
-
-
-def _through(line: LaneLine, sections: list[_Section], height_cm: float) -> LaneLine:
-    """Put a line together anew, with a triple knot at each corner."""
-    low, high = _span_cm(line)
-    apart_cm = _LEAST_CUBIC * height_cm
-    sections = [section.beside_seam(low, line.period_cm, 0.25 * apart_cm) for section in sections]
-    kinks = [_in_lap(s, low, line.period_cm) for section in sections for s in section.corners_cm.tolist()]
-    breaks = line.knots_cm[3:-3]
-    for section in sections:
-        past = section.past(breaks, line.period_cm)
-        breaks = breaks[(past <= 0.0) | (past >= section.s_cm[-1] - section.s_cm[0])]
-        ends = [_in_lap(section.s_cm[i], low, line.period_cm) for i in (0, 1, -2, -1)]
-        breaks = np.concatenate([breaks, ends])
-    kept = [low, high, *kinks]
-    for at in np.sort(breaks).tolist():
-        if min(abs(at - other) for other in kept) > apart_cm and low < at < high:
-            kept.append(at)
-    basis = CubicBasis(np.sort(np.array(kept + 2 * kinks)), line.period_cm is not None)
-    simple = np.sort(np.array(kept))
-    share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    s_cm = (simple[:-1, None] + share * np.diff(simple)[:, None]).ravel()
-    points, sigma_cm = line.everywhere(s_cm), line.sigma_at_cm.copy()
-    supported = line.supported_cm
-    known = line.supported(line.sigma_s_cm)
-    usual_cm = float(np.median(sigma_cm[known])) if known.any() else np.inf
-    for section in sections:
-        begin, taken, left, end = section.s_cm[[0, 1, -2, -1]]
-        past = section.past(s_cm, line.period_cm)
-        inside = (past >= 0.0) & (past <= end - begin)
-        points[inside] = section.blended(begin + past[inside], points[inside])
-        # The pieces are held by their borders as the rest of the line is by its own.
-        past = section.past(line.sigma_s_cm, line.period_cm)
-        inside = (past >= taken - begin) & (past <= left - begin)
-        sigma_cm[inside] = np.minimum(sigma_cm[inside], usual_cm)
-        if not line.supported(np.linspace(begin, end, _SAMPLES)).all():
-            supported = np.concatenate([supported, [[taken, left]]])
-    return replace(
-        line,
-        knots_cm=basis.knots_cm,
-        coefficients_cm=basis.unfolded(basis.fitted(s_cm, points)),
-        supported_cm=supported,
-        sigma_at_cm=sigma_cm,
-    )
-
-
-def _in_lap(s_cm: float, low_cm: float, period_cm: float | None) -> float:
-    return s_cm if period_cm is None else low_cm + (s_cm - low_cm) % period_cm
