@@ -126,17 +126,16 @@ def _polyline(  # type: ignore[no-untyped-def]
 
 
 def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"]) -> None:
-    """Draw the chosen frames of a map with their projected lines (green left, magenta right) and points."""
-    drive_map = mapped.drive_map
-    tiles = [
-        draw_lines(
-            _frame(mapped, k),
-            lines_at(drive_map, k),
-            drive_map.camera,
-            f"{drive_map.frames[k]}",
-        )
-        for k in map(int, chosen)
-    ]
+    """Draw the chosen frames of a map with their projected lines (green left, magenta right) and points.
+
+    Lines that the images contradict, and that have no labels, are red.
+    """
+    drive_map, tiles = mapped.drive_map, []
+    for k in map(int, chosen):
+        lines, wrong = lines_at(drive_map, k), drive_map.contradicted[k]
+        text = f"{drive_map.frames[k]}"
+        kept, withheld = lines.without(wrong), lines.without(~wrong)
+        tiles.append(draw_lines(_frame(mapped, k), kept, drive_map.camera, text, withheld))
     write_png(path, _tiled(tiles))
 
 

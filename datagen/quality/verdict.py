@@ -236,6 +236,8 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     """Grade a map."""
     # Causes before what comes of them.
     checks = (
+        _lane_width,
+        _scale,
         _uneven,
         _outside,
         _in_view,
@@ -244,8 +246,6 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
         _contradicted,
         _withheld,
         _camera,
-        _lane_width,
-        _scale,
     )
     found = [finding for check in checks for finding in check(evidence, settings)]
     # The worst first.
@@ -451,8 +451,8 @@ def _outside(e: MapEvidence, s: VerdictSettings) -> _Findings:
             grade,
             f"in {share} of the frames both lines of the lane lie beside the window of the labels",
             "is the lane width right? If it is, tilt the camera, or drive a narrower lane",
-            f"both lines lie beside the window in {share} of the frames, "
-            f"{_at_most('max_outside', s.max_outside, s)}",
+            f"both lines lie beside the window in {share} of the frames, expected {_percent(s.max_outside)} "
+            f"at most, rejected above {_percent(s.usable * s.max_outside)} (max_outside)",
         )
 
 
@@ -492,8 +492,9 @@ def _withheld(e: MapEvidence, s: VerdictSettings) -> _Findings:
             grade,
             "in many places the images disagree with the map",
             f"look at the withheld places of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
-            f"the images disagree with the map along {_percent(e.withheld_share)} of its lines, "
-            f"{_at_most('max_withheld', s.max_withheld, s)}",
+            f"the images disagree with the map along {_percent(e.withheld_share)} of its lines, expected "
+            f"{_percent(s.max_withheld)} at most, rejected above {_percent(s.usable * s.max_withheld)} "
+            "(max_withheld)",
         )
 
 

@@ -15,6 +15,9 @@ from lanenet.evaluation.tables import LARGE_CM, show_cm
 
 #: A map is asked about this many frames before and after the worst one. Chosen: a second at 20 frames/s.
 _NEAR_FRAMES = 20
+#: Share of answered points below which, and share of large errors above which, nobody should drive with it.
+#: Chosen: a car that knows its lane less than every other time, or errs once in two seconds.
+_LEAST_ANSWERED, _MOST_LARGE = 0.5, 0.1
 
 
 def verdict_sentence(comparison: Comparison, seen: Sequence[SeenSource], where: str) -> str:
@@ -27,12 +30,14 @@ def verdict_sentence(comparison: Comparison, seen: Sequence[SeenSource], where: 
     """
     stats = comparison.tables[comparison.first].all
     if not stats.count:
-        return f"{where} it answers none of the {stats.truth_count} points"
+        return f"not fit to drive with: {where} it answers none of the {stats.truth_count} points"
     errors = comparison.errors_cm[comparison.first]
     large = float((errors[np.isfinite(errors)] > LARGE_CM).mean())
+    unfit = "not fit to drive with: " if stats.coverage < _LEAST_ANSWERED or large > _MOST_LARGE else ""
     said = (
-        f"{where} it lies {show_cm(stats.median_cm)} cm from the {comparison.reference} (median; 95 % of its "
-        f"answers within {show_cm(stats.p95_cm)} cm) and answers {100.0 * stats.coverage:.0f} % of the points"
+        f"{unfit}{where} it lies {show_cm(stats.median_cm)} cm from the {comparison.reference} (median; "
+        f"95 % of its answers within {show_cm(stats.p95_cm)} cm) and answers {100.0 * stats.coverage:.0f} % "
+        "of the points"
     )
     if not large:
         return f"{said}; no answer is off by more than {LARGE_CM:g} cm"

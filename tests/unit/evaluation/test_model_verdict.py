@@ -54,7 +54,16 @@ def test_the_worst_frame_is_named_and_the_maps_own_doubt_there(tmp_path: Path, r
 
 def test_a_model_that_answers_nothing_has_no_median():
     said = verdict_sentence(*compared(np.full_like(TRUTH, np.nan), "m"), "here")
-    assert said == "here it answers none of the 180 points"
+    assert said == "not fit to drive with: here it answers none of the 180 points"
+
+
+def test_a_model_that_answers_little_or_is_often_far_off_is_not_fit_to_drive_with():
+    good = TRUTH + 0.5
+    rarely, wrong = good.copy(), good.copy()
+    rarely[: len(TRUTH) * 6 // 10] = np.nan
+    wrong[::5] += 9.0
+    told = [verdict_sentence(*compared(answers, "m"), "here") for answers in (good, rarely, wrong)]
+    assert [said.startswith("not fit to drive with: here it lies") for said in told] == [False, True, True]
 
 
 def test_one_table_holds_the_detectors_that_were_asked_for():
