@@ -179,7 +179,7 @@ def frame_residual_cm(points_cm: Float[np.ndarray, "m 2"], lines: FrameLines, ta
         if len(known) < 2 or not len(near):
             continue
         offset = np.abs(_distance_to_polyline(near, known))
-        # Of most of what lies in the image: a frame shows little of the line.
+        # One width for what the frame shows: it changes by little over so short a way.
         marking_cm = float(np.median(lines.markings_cm(side, tape_cm)))
         distances.append(np.abs(offset[offset < 1.5 * marking_cm + 1.0] - 0.5 * marking_cm))
     found = np.concatenate(distances) if distances else np.empty(0)

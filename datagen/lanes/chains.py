@@ -63,12 +63,11 @@ class Chain:
         """The same closed chain, from another place on it."""
         piece = int(np.searchsorted(self.lengths_cm, past_cm, side="right")) - 1
         begin = self.at(np.array([past_cm]))
-        # Its seam is no corner.
+        # Its seam is no corner: the first piece and the last are halves of one.
         points = [begin, self.points_cm[piece + 1 : -1], self.points_cm[1 : piece + 1], begin]
-        widths = self.markings_cm
-        if not 0 < piece < len(widths) - 1:
-            return replace(self, points_cm=np.concatenate([begin, self.points_cm[1:-1], begin]))
-        markings = [widths[piece:-1], widths[: piece + 1]]
+        markings = [self.markings_cm[piece:-1], self.markings_cm[: piece + 1]]
+        if piece in (0, len(self.markings_cm) - 1):
+            markings = [self.markings_cm]
         return Chain(np.concatenate(points), np.concatenate(markings))
 
     def at(self, past_cm: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from datagen.lanes.chains import Chain, chains_of
 from datagen.lanes.path import MapEdges, left_of
-from datagen.lanes.sections import BLEND, Section, in_lap, span_cm, through
+from datagen.lanes.sections import BLEND, Section, in_lap, through
 from datagen.lanes.tape import Piece, straight_pieces
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.segments import true_runs
@@ -97,7 +97,7 @@ class _Search:
     @cached_property
     def s_cm(self) -> Float[np.ndarray, "p"]:
         """Positions of the places."""
-        low, high = span_cm(self.line)
+        low, high = self.line.span_cm
         count = max(1, int((high - low) / (_PLACE * self.height_cm)))
         return low + np.arange(count) * (high - low) / count
 
@@ -224,7 +224,7 @@ class _Search:
         if rows[3] >= len(past_cm):
             s_cm = np.concatenate([s_cm[:-2], [s_cm[-1], s_cm[-1] + blend_cm]])
             points = np.concatenate([points[:-2], points[-1:], self.line.everywhere(s_cm[-1:])])
-        low, high = span_cm(self.line)
+        low, high = self.line.span_cm
         if not self.closed and (s_cm[0] < low or s_cm[-1] > high):
             return None
         aside_cm = np.hypot(*(points[[1, -2]] - self.line.everywhere(s_cm[[1, -2]])).T)

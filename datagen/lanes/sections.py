@@ -82,14 +82,9 @@ class Section:
         return line_cm + share * (pieces - line_cm)
 
 
-def span_cm(line: LaneLine) -> tuple[float, float]:
-    """Positions along a line at which it begins and ends."""
-    return float(line.knots_cm[3]), float(line.knots_cm[-4])
-
-
 def through(line: LaneLine, sections: list[Section], height_cm: float) -> LaneLine:
     """Put a line together anew, with a triple knot at each corner."""
-    low, high = span_cm(line)
+    low, high = line.span_cm
     apart_cm = _LEAST_CUBIC * height_cm
     sections = [section.beside_seam(low, line.period_cm, 0.25 * apart_cm) for section in sections]
     kinks = [in_lap(s, low, line.period_cm) for section in sections for s in section.corners_cm.tolist()]

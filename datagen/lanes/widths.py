@@ -8,7 +8,8 @@ beside the place that the usual width gives it, though the middle of the line is
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+from scipy.ndimage import median
 from scipy.spatial import cKDTree
 
 from datagen.lanes.path import MapEdges, left_of
@@ -42,51 +43,45 @@ def marking_widths(line: LaneLine, edges: MapEdges, camera_height_cm: float) -> 
     s_cm = line.sigma_s_cm
     if not np.isfinite(line.marking_cm) or not len(edges.xy_cm) or len(s_cm) < 2:
         return np.empty(0)
-    at_cm, right = line.everywhere(s_cm), -left_of(line.everywhere(s_cm, 1))
+    at_cm, to_right = line.everywhere(s_cm), -left_of(line.everywhere(s_cm, 1))
     reach_cm = _FARTHEST * line.marking_cm + float(s_cm[1] - s_cm[0])
     apart_cm, nearest = cKDTree(at_cm).query(edges.xy_cm, distance_upper_bound=reach_cm)
     near = np.flatnonzero(np.isfinite(apart_cm))
     sample = np.asarray(nearest)[near]
-    across_cm = np.sum((edges.xy_cm[near] - at_cm[sample]) * right[sample], axis=1)
-    facing = np.sum(edges.normals[near] * right[sample], axis=1)
+    across_cm = np.sum((edges.xy_cm[near] - at_cm[sample]) * to_right[sample], axis=1)
+    facing = np.sum(edges.normals[near] * to_right[sample], axis=1)
     # The left border brightens to the right, and lies to the left of the middle.
     aside_cm = -np.sign(facing) * across_cm
     good = (aside_cm > _NEAREST * line.marking_cm) & (aside_cm < _FARTHEST * line.marking_cm)
     good &= np.abs(facing) > _MIN_COSINE
-    place = np.floor((s_cm[sample[good]] - s_cm[0]) / (_PLACE * camera_height_cm)).astype(np.int64)
-    count = int((s_cm[-1] - s_cm[0]) / (_PLACE * camera_height_cm)) + 1
-    left = _medians(place, aside_cm[good], facing[good] > 0.0, count)
-    width_cm = left + _medians(place, aside_cm[good], facing[good] < 0.0, count)
-    smooth_cm = _running_median(width_cm, line.period_cm is not None)
-    centres_cm = s_cm[0] + (np.arange(count) + 0.5) * _PLACE * camera_height_cm
+    place_cm = _PLACE * camera_height_cm
+    place = ((s_cm - s_cm[0]) / place_cm).astype(np.int64)
+    count = int(place[-1]) + 1
+    borders = [good & (side * facing > 0.0) for side in (1.0, -1.0)]
+    left, right = (_medians(place[sample[rows]], aside_cm[rows], count) for rows in borders)
+    smooth_cm = _running_median(left + right, line.period_cm is not None)
     known = np.isfinite(smooth_cm)
     if not known.any():
         return np.empty(0)
+    centres_cm = s_cm[0] + (np.arange(count) + 0.5) * place_cm
     found = np.interp(s_cm, centres_cm[known], smooth_cm[known], period=line.period_cm)
-    there = np.minimum(((s_cm - s_cm[0]) / (_PLACE * camera_height_cm)).astype(np.int64), count - 1)
-    return np.where(known[there], found, line.marking_cm)
+    return np.where(known[place], found, line.marking_cm)
 
 
 def _medians(
-    place: Int[np.ndarray, "n"], values: Float[np.ndarray, "n"], taken: Bool[np.ndarray, "n"], count: int
+    place: Int[np.ndarray, "n"], values: Float[np.ndarray, "n"], count: int
 ) -> Float[np.ndarray, "p"]:
-    """Median of some of the values by place; NaN where they are too few."""
-    medians = np.full(count, np.nan)
-    order = np.lexsort((values[taken], place[taken]))
-    ordered, sorted_place = values[taken][order], place[taken][order]
-    places, first, counts = np.unique(sorted_place, return_index=True, return_counts=True)
-    enough = counts >= _MIN_POINTS
-    middle = 0.5 * (ordered[first + (counts - 1) // 2] + ordered[first + counts // 2])
-    medians[places[enough]] = middle[enough]
-    return medians
+    """Median of the values by place; NaN where they are too few."""
+    if not len(values):
+        return np.full(count, np.nan)
+    enough = np.bincount(place, minlength=count) >= _MIN_POINTS
+    return np.where(enough, median(values, place, np.arange(count)), np.nan)
 
 
 def _running_median(values: Float[np.ndarray, "p"], closed: bool) -> Float[np.ndarray, "p"]:
     """Median of what is known around each place; NaN where that is too little."""
-    if closed:
-        padded = np.pad(values, _AROUND, mode="wrap")
-    else:
-        padded = np.pad(values, _AROUND, constant_values=np.nan)
+    filled = {"mode": "wrap"} if closed else {"constant_values": np.nan}
+    padded = np.pad(values, _AROUND, **filled)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _AROUND + 1)
     found = np.full(len(values), np.nan)
     enough = np.isfinite(windows).sum(axis=1) >= _MIN_PLACES

@@ -142,10 +142,7 @@ def share_in_view(camera: Camera, points_cm: Float[np.ndarray, "n 6"]) -> float:
     """Share of labelled points that lie in a camera's image; NaN without any."""
     ahead_cm = np.broadcast_to(np.tile(ROWS_CM, len(SIDES)), points_cm.shape)
     places = np.stack([points_cm, ahead_cm], axis=-1)[np.isfinite(points_cm)]
-    uv = camera.project_ground(places)
-    inside = np.isfinite(uv).all(axis=1) & (uv >= 0.0).all(axis=1)
-    inside &= (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    return float(inside.mean()) if len(inside) else float("nan")
+    return float(camera.shows_ground(places).mean()) if len(places) else float("nan")
 
 
 def quality_figures(quality: MapQuality) -> dict[str, Any]:

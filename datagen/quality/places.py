@@ -222,7 +222,7 @@ def withheld_figures(drive_map: DriveMap, wrong: list[WrongPlace]) -> dict[str, 
     supported_cm = withheld_cm = 0.0
     for lines in drive_map.lines.values():
         for line in (line for line in lines if line.rank == 0):
-            s_cm = np.arange(_first_cm(line), _first_cm(line) + _place_count(line) * _PLACE_CM, _PLACE_CM)
+            s_cm = np.arange(line.span_cm[0], line.span_cm[0] + _place_count(line) * _PLACE_CM, _PLACE_CM)
             known = line.supported(s_cm)
             supported_cm += float(known.sum()) * _PLACE_CM
             withheld_cm += float((known & line.contradicted(s_cm)).sum()) * _PLACE_CM
@@ -265,7 +265,7 @@ def gather_evidence(mapped: MappedDrive) -> dict[tuple[int, int], PlaceEvidence]
             uv, beside_uv = (tilted.project_ground(seen.at_cm + by_cm * seen.right) for by_cm in (0.0, 0.2))
             shown = in_view(uv, beside_uv, keep)
             seen = SeenPlaces(*(column[shown] for column in seen))
-            widths_cm = line.widths_cm(_first_cm(line) + (seen.place + 0.5) * _PLACE_CM)
+            widths_cm = line.widths_cm(line.span_cm[0] + (seen.place + 0.5) * _PLACE_CM)
             widths_cm = np.where(np.isfinite(widths_cm), widths_cm, drive_map.meta.tape_cm)
             px_per_cm = np.linalg.norm(beside_uv - uv, axis=1)[shown] / 0.2
             met_px = _MET_PX / reference_scale(camera)
@@ -334,7 +334,7 @@ def wrong_places(
     for run in found:
         unseen = _around(evidence.views.sum(axis=0)[None], closed)[0] < 0.5
         taken[_with_ends(run, (np.abs(mean_off) > _END_CM) | ~confirmed, unseen, closed)] = True
-    low = _first_cm(line)
+    low = line.span_cm[0]
     places = []
     for run in true_runs(taken, closed):
         start = low + float(run[0]) * _PLACE_CM
@@ -365,7 +365,7 @@ class OtherLine(NamedTuple):
 
 def sharp_places(line: LaneLine) -> Bool[np.ndarray, "p"]:
     """Return where a line turns sharply. A line beside it that has no paint there may turn in any way."""
-    s_cm = _first_cm(line) + (np.arange(_place_count(line)) + 0.5) * _PLACE_CM
+    s_cm = line.span_cm[0] + (np.arange(_place_count(line)) + 0.5) * _PLACE_CM
     before, after = (line.everywhere(s_cm + by_cm, 1) for by_cm in (-0.5 * _WITHIN_CM, 0.5 * _WITHIN_CM))
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     return np.asarray(np.abs(np.arctan2(cross, np.sum(before * after, axis=1))) > _SHARP_RAD)
@@ -556,7 +556,7 @@ class SeenPlaces(NamedTuple):
 def _places_ahead(drive_map: DriveMap, k: int, line: LaneLine) -> SeenPlaces:
     """The places of a line that the map's k-th frame may look at and that the line knows."""
     wheelbase_cm, forward = drive_map.camera.wheelbase_cm, bool(drive_map.lanes.forward[k])
-    low, count = _first_cm(line), _place_count(line)
+    low, count = line.span_cm[0], _place_count(line)
     steps = np.arange(1, int((wheelbase_cm + _REACH_CM + 10.0) / _PLACE_CM))
     cell = int(np.floor((drive_map.s_cm[k] - low) / _PLACE_CM)) + (steps if forward else -steps)
     if line.period_cm is None:
@@ -574,13 +574,10 @@ def _places_ahead(drive_map: DriveMap, k: int, line: LaneLine) -> SeenPlaces:
     return SeenPlaces((cell % count)[inside], lap[inside], ends[1][inside], right[inside])
 
 
-def _first_cm(line: LaneLine) -> float:
-    return float(line.knots_cm[3])
-
-
 def _place_count(line: LaneLine) -> int:
     """Number of whole places along a line; the rest at its end is shorter than one."""
-    return max(1, int((float(line.knots_cm[-4]) - _first_cm(line)) / _PLACE_CM))
+    low, high = line.span_cm
+    return max(1, int((high - low) / _PLACE_CM))
 
 
 def _spread_frames(drive_map: DriveMap) -> Int[np.ndarray, "m"]:

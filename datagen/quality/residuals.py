@@ -36,7 +36,7 @@ from lanenet.perception.edges.road import RoadTable
 REFERENCE_WIDTH = 160.0
 #: Width of road, [cm], that a pixel of such an image shows so far ahead, [cm], at least: one that sees it
 #: more finely, through a long lens or from nearby, is judged by the same lengths, not by smaller ones.
-#: Measured: 48 cameras, three of them real, show 0.46 cm and more; that of `blue_tape` 0.14 cm.
+#: Measured: 315 simulated cameras and three real ones show 0.43 cm and more; that of `blue_tape` 0.14 cm.
 _FINEST_CM, _FINEST_AHEAD_CM = 0.45, 45.0
 #: Largest distance of an edge from its border, in pixels of such an image. Chosen: eight times the residuals
 #: of good maps.

@@ -341,6 +341,12 @@ def _at_most(name: str, bound: float, settings: VerdictSettings, unit: str = "")
     return f"expected {bound:g}{unit} at most, rejected above {settings.usable * bound:g}{unit} ({name})"
 
 
+def _share_at_most(name: str, bound: float, settings: VerdictSettings) -> str:
+    """The same of a share, in per cent."""
+    most = 100.0 * settings.usable * bound
+    return f"expected {100.0 * bound:.3g} % at most, rejected above {most:.3g} % ({name})"
+
+
 def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
@@ -451,8 +457,8 @@ def _outside(e: MapEvidence, s: VerdictSettings) -> _Findings:
             grade,
             f"in {share} of the frames both lines of the lane lie beside the window of the labels",
             "is the lane width right? If it is, tilt the camera, or drive a narrower lane",
-            f"both lines lie beside the window in {share} of the frames, expected {_percent(s.max_outside)} "
-            f"at most, rejected above {_percent(s.usable * s.max_outside)} (max_outside)",
+            f"both lines lie beside the window in {share} of the frames, "
+            f"{_share_at_most('max_outside', s.max_outside, s)}",
         )
 
 
@@ -472,16 +478,13 @@ def _contradicted(e: MapEvidence, s: VerdictSettings) -> _Findings:
     grade = _bounded(e.contradicted_share, s.max_contradicted, s)
     if grade != "good":
         # To a tenth: the bound is no whole number, and what exceeds it by little would read like it.
-        share, bound, most = (
-            f"{100.0 * each:.3g} %"
-            for each in (round(e.contradicted_share, 3), s.max_contradicted, s.usable * s.max_contradicted)
-        )
+        share = f"{100.0 * round(e.contradicted_share, 3):.3g} %"
         yield Finding(
             grade,
             "in many frames the images disagree with the map",
             f"look at the worst frames of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
             f"the images disagree with {share} of the frames' lines on the map, "
-            f"expected {bound} at most, rejected above {most} (max_contradicted)",
+            f"{_share_at_most('max_contradicted', s.max_contradicted, s)}",
         )
 
 
@@ -492,9 +495,8 @@ def _withheld(e: MapEvidence, s: VerdictSettings) -> _Findings:
             grade,
             "in many places the images disagree with the map",
             f"look at the withheld places of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
-            f"the images disagree with the map along {_percent(e.withheld_share)} of its lines, expected "
-            f"{_percent(s.max_withheld)} at most, rejected above {_percent(s.usable * s.max_withheld)} "
-            "(max_withheld)",
+            f"the images disagree with the map along {_percent(e.withheld_share)} of its lines, "
+            f"{_share_at_most('max_withheld', s.max_withheld, s)}",
         )
 
 

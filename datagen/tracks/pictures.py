@@ -33,10 +33,7 @@ def draw_joined(
         places: Where lines were laid anew, common map frame.
     """
     clouds = [np.concatenate([np.empty((0, 2)), *assembled.near_points]) for _, assembled, _ in members]
-    lines = [
-        line.points(np.arange(float(line.knots_cm[3]), float(line.knots_cm[-4]), 1.0))
-        for line in members[0][2].lines[0]
-    ]
+    lines = [line.points(np.arange(*line.span_cm, 1.0)) for line in members[0][2].lines[0]]
     every = np.concatenate([*clouds, *(line[np.isfinite(line[:, 0])] for line in lines)])
     low, high = every.min(axis=0) - 20.0, every.max(axis=0) + 20.0
     scale = _SIZE_PX / float((high - low).max())

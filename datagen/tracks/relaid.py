@@ -114,7 +114,7 @@ def masked_lines(lines: Sequence[LaneLine], places: Sequence[RelaidPlace], lane_
     if not places:
         return list(lines)
     points = np.concatenate([place.points_cm for place in places])
-    positions = [np.arange(float(line.knots_cm[3]), float(line.knots_cm[-4]), STEP_CM) for line in lines]
+    positions = [np.arange(*line.span_cm, STEP_CM) for line in lines]
     found = [
         cKDTree(line.everywhere(s_cm)).query(points) for line, s_cm in zip(lines, positions, strict=True)
     ]

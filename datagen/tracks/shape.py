@@ -208,7 +208,7 @@ def shape_of(drive_map: DriveMap, edges: Float[np.ndarray, "m 6"], name: str) ->
 
 def sample_line(line: LaneLine, s_frames_cm: Float[np.ndarray, "n"]) -> SampledLine:
     """Sample a line evenly, as far as the frames drove along it."""
-    low, high = line.knots_cm[3], line.knots_cm[-4]
+    low, high = line.span_cm
     if line.period_cm is None:
         low, high = max(low, float(s_frames_cm.min())), min(high, float(s_frames_cm.max()) + STEP_CM)
     fine_cm = np.linspace(low, high, max(int((high - low) / (0.25 * STEP_CM)), 2))

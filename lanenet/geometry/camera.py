@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 CameraModel = Literal["fisheye", "pinhole"]
 
@@ -181,6 +181,13 @@ class Camera:
         position = self.mounting.position_car_cm
         above = np.concatenate([points_car_cm, np.zeros((len(points_car_cm), 1))], axis=1) - position
         return self.project_rays(above @ self.mounting.camera_from_car.T)
+
+    def shows_ground(self, points_car_cm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """Return which points of the road lie in the image."""
+        pixels = self.project_ground(points_car_cm)
+        with np.errstate(invalid="ignore"):
+            inside = (pixels >= -0.5) & (pixels < (self.width - 0.5, self.height - 0.5))
+        return np.asarray(inside.all(axis=1))
 
     def intersect_ground(self, pixels_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Meet each pixel's viewing ray with the road plane.

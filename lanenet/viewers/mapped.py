@@ -108,7 +108,7 @@ def map_lines(drive_map: DriveMap) -> dict[str, Float[np.ndarray, "_ 2"]]:
     lines = {}
     for segment, found in drive_map.lines.items():
         for line in found:
-            start, end = float(line.knots_cm[3]), float(line.knots_cm[-4])
+            start, end = line.span_cm
             s_cm = line.with_corners(np.linspace(start, end, max(2, int((end - start) / _DRAWN_CM) + 1)))
             lines[f"{segment}/{line.side}_{line.rank}"] = line.points(s_cm)
     return lines

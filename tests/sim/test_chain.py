@@ -74,7 +74,7 @@ def test_train_leaves_a_checkpoint_that_is_complete(finished):
         "example.jpg",
     }
     assert "last.pt" not in names
-    assert "on the test drives it" in output and "against the truth" in output
+    assert "verdict: not fit to drive with: on the test drives it" in output and "against the truth" in output
     assert "painter" not in output
     tables = (folder / "ck" / "tiny" / "results.md").read_text()
     for name in ("network", "lane-filter", "hough-value", "painter", "against the truth"):

@@ -69,6 +69,11 @@ class LaneLine:
         return -self.rank if self.side == "left" else 1 + self.rank
 
     @property
+    def span_cm(self) -> tuple[float, float]:
+        """Positions at which the line begins and ends; of a lap, its seam."""
+        return float(self.knots_cm[3]), float(self.knots_cm[-4])
+
+    @property
     def dashed(self) -> bool:
         """Whether the line is dashed; then there is a lane on either side of it."""
         return self.unpainted > _DASHED_SHARE
@@ -97,7 +102,7 @@ class LaneLine:
 
     def everywhere(self, s_cm: Float[np.ndarray, "m"], derivative: int = 0) -> Float[np.ndarray, "m 2"]:
         """Evaluate the line or a derivative, also where it is not supported."""
-        low, high = self.knots_cm[3], self.knots_cm[-4]
+        low, high = self.span_cm
         s = np.clip(s_cm, low, high) if self.period_cm is None else low + np.mod(s_cm - low, self.period_cm)
         return np.array(self._spline(s, nu=derivative))
 

@@ -112,8 +112,7 @@ def check_camera(camera: Camera) -> list[Check]:
 
 
 def _sees(camera: Camera, y_cm: float) -> bool:
-    u, v = camera.project_ground(np.array([[0.0, y_cm]]))[0]
-    return bool(-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5)
+    return bool(camera.shows_ground(np.array([[0.0, y_cm]]))[0])
 
 
 def _python() -> Check:

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from lanenet.config import Settings
 from lanenet.errors import ModelMismatchError
@@ -192,15 +192,7 @@ _PLACES_CM, _IN_SIGHT = np.arange(15.0, 41.0, 5.0), 0.6
 def _sees(camera: Camera, line_cm: Float[np.ndarray, "3"]) -> bool:
     """Return whether most of a line, given by its points at the label rows, is in a camera's image."""
     x = np.polyval(parabola_through(*line_cm.tolist()), _PLACES_CM)
-    return bool(_in_image(camera, np.stack([x, _PLACES_CM], axis=1)).mean() >= _IN_SIGHT)
-
-
-def _in_image(camera: Camera, points_cm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-    """Return which ground points lie in a camera's image."""
-    pixels = camera.project_ground(points_cm)
-    with np.errstate(invalid="ignore"):
-        inside = (pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))
-    return np.asarray(inside.all(axis=1))
+    return bool(camera.shows_ground(np.stack([x, _PLACES_CM], axis=1)).mean() >= _IN_SIGHT)
 
 
 def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
@@ -224,7 +216,7 @@ def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:
 def _share_seen(window: BirdseyeWindow, camera: Camera) -> float:
     """Return the share of the far half of a window that lies in a camera's image."""
     row, column = np.mgrid[0 : window.rows / 2 : 16j, 0 : window.columns - 1 : 32j]
-    return float(_in_image(camera, window.points(np.stack([row.ravel(), column.ravel()], axis=1))).mean())
+    return float(camera.shows_ground(window.points(np.stack([row.ravel(), column.ravel()], axis=1))).mean())
 
 
 def _centre_cm(points_cm: Float[np.ndarray, "6"], width_cm: float | None) -> float:

@@ -216,7 +216,9 @@ class LaneTracker:
             # A solid line that is not seen ahead turns away there, or ends.
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
                 found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = np.inf
-        if not decided or self._side_is_a_guess(pair, present):
+        if decided:
+            self._arrive(pair, present)
+        if not decided or self._side_is_a_guess(present):
             found_sigma_cm[:] = np.inf
         known = self._known(found_cm, found_sigma_cm, points_cm)
         return (*known, np.array([left.seen_cm, right.seen_cm]))
@@ -321,24 +323,28 @@ class LaneTracker:
             starts.append(_Start(side, line.points_cm, _moved(line.sigma_cm), _BY_CONTINUING_CM, None))
         return starts
 
-    def _on_line(self) -> bool:
-        """Return whether the front axle's middle was on one of the lane's lines."""
-        if self._last is None:
-            return False
-        beside_cm = min(abs(line_cm[0]) for line_cm in self._last[0])
-        return beside_cm < _ON_LINE * self.lane.likely_cm
-
-    def _side_is_a_guess(self, pair: tuple[_Candidate, _Candidate], presence: list[float]) -> bool:
-        """Return whether nothing tells on which side of a line the front axle's middle is."""
+    def _nearest_line(self) -> tuple[int, float]:
+        """Return the lane's line that is nearest to the front axle's middle, and how far, in lane widths."""
         assert self._last is not None
         beside_cm = [abs(line_cm[0]) for line_cm in self._last[0]]
-        nearest = beside_cm.index(min(beside_cm))
-        share = beside_cm[nearest] / self.lane.likely_cm
+        side = beside_cm.index(min(beside_cm))
+        return side, beside_cm[side] / self.lane.likely_cm
+
+    def _on_line(self) -> bool:
+        """Return whether the front axle's middle was on one of the lane's lines."""
+        return self._last is not None and self._nearest_line()[1] < _ON_LINE
+
+    def _arrive(self, pair: tuple[_Candidate, _Candidate], presence: list[float]) -> None:
+        """End a change of lane, once the new one has shown both of its lines, or the crossed one is far."""
         shown = all(
             line.seen_cm >= _WIDTH_SEEN_CM and p > SEEN for line, p in zip(pair, presence, strict=True)
         )
-        self._entered = self._entered and not shown and share < _NEAR_LINE
-        unseen = presence[nearest] < SEEN and share < _NEAR_LINE
+        self._entered = self._entered and not shown and self._nearest_line()[1] < _NEAR_LINE
+
+    def _side_is_a_guess(self, presence: list[float]) -> bool:
+        """Return whether nothing tells on which side of a line the front axle's middle is."""
+        side, share = self._nearest_line()
+        unseen = presence[side] < SEEN and share < _NEAR_LINE
         return share < _ASTRIDE or unseen or self._entered
 
     def _beyond_a_crossed_line(self) -> list[_Start]:
