@@ -104,8 +104,8 @@ def chains_of(
         first = first if along else first.turned()
         points, markings, rest = joiner.walk(first, rest, first)
         if len(points) == 1 or points[-1] is not points[0]:
-            # Backward is forward the other way round.
-            backward, widths, rest = joiner.walk(first.turned(), rest)
+            # Backward is forward the other way round, on what is left of the piece.
+            backward, widths, rest = joiner.walk(_from(points[0], first.turned()), rest)
             points = [*reversed(backward), *points]
             markings = [*reversed(widths[1:]), *markings]
         chains.append(Chain(np.array(points), np.array(markings)))
@@ -155,9 +155,7 @@ class _Joiner:
                 middle = 0.5 * (home.begin_cm + home.end_cm)
                 return [middle, *points, middle], markings, others
             others = [other for other in others if not other.same(following)]
-            # What is left of it bends by so much less.
-            left = float(np.linalg.norm(following.end_cm - meet)) / following.length_cm
-            piece = replace(following, begin_cm=meet, bend_rad=left * following.bend_rad)
+            piece = _from(meet, following)
 
     def _meet(self, before: Piece, after: Piece) -> Float[np.ndarray, "2"] | None:
         """Where one piece goes over into another one; None where it does not."""
@@ -197,6 +195,12 @@ class _Joiner:
             length_cm = min(tip_cm, float(np.linalg.norm(end_cm - meet_cm)))
             found.append(self.on_marking(meet_cm, meet_cm + length_cm * along, piece.marking_cm))
         return all(on.mean() >= _ON_TIP for on in found)
+
+
+def _from(begin_cm: Float[np.ndarray, "2"], piece: Piece) -> Piece:
+    """What is left of a piece from a point on; it bends by so much less."""
+    left = float(np.linalg.norm(piece.end_cm - begin_cm)) / piece.length_cm
+    return replace(piece, begin_cm=begin_cm, bend_rad=left * piece.bend_rad)
 
 
 def _arc_rad(before: Piece, after: Piece, gap_cm: float, turn_rad: float) -> float:
