@@ -32,7 +32,7 @@ namespace {
 
 constexpr int kRows = 3, kNodes = 8, kSteps = 2, kPlaces = 4;  // label rows, nodes, steps, bins beside a row
 constexpr int kMost = 128, kMostBins = 64;                     // edge points of a line, bins along it
-constexpr int kPerLine = 14;
+constexpr int kAsked = 10, kPerLine = 14;                     // numbers of a line, before and after
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 // The settings, as _NUMBERS of refinement.py has them.
@@ -47,7 +47,8 @@ struct Numbers {
 // Edge points within the label rows.
 struct Near {
   std::vector<double> x, y, normal_x, normal_y, yellow, red;
-  std::vector<double> key, off, agree, chosen;
+  std::vector<double> key, chosen;
+  std::vector<std::uint8_t> beside;
   std::vector<int> index;
   int count;
 };
@@ -57,7 +58,8 @@ struct Beside {
   double x[kMost], y[kMost], normal_x[kMost], normal_y[kMost], yellow[kMost], red[kMost], certain[kMost];
   double at[kRows][kMost], slope[kMost], beyond[kMost], across[kMost], agree[kMost], gap[kMost];
   double weight[kMost], gate[kMost], share[2][kMost], lean[2][kMost], bent[kMost];
-  int node[kMost], n;
+  // Node before each, bin in which it lies, and those that count at present.
+  int node[kMost], bin[kMost], active[kMost], n;
 };
 
 struct Parabola {
@@ -101,9 +103,9 @@ WITHIN void times(const double (*matrix)[n], const double* vector, double* out) 
 
 template <class T>
 void take_near(const Numbers& s, const T* points, const T* normals, const T* hues, size_t n, Near& out) {
-  for (auto* values : {&out.x, &out.y, &out.normal_x, &out.normal_y, &out.yellow, &out.red, &out.key, &out.off,
-                       &out.agree, &out.chosen})
+  for (auto* values : {&out.x, &out.y, &out.normal_x, &out.normal_y, &out.yellow, &out.red, &out.key, &out.chosen})
     values->resize(n);
+  out.beside.resize(n);
   out.index.resize(n);
   // Every point is written, and the next one over it unless it counts: so there is no branch to guess.
   size_t count = 0;
@@ -121,26 +123,27 @@ void take_near(const Numbers& s, const T* points, const T* normals, const T* hue
   out.count = static_cast<int>(count);
 }
 
-WIDE void measure_off(const double* x, const double* y, const double* normal_x, const double* normal_y, int n,
-                      double a, double b, double c, double* off, double* agree) {
-  const double a2 = 2.0 * a;
+// Whether each edge point is within reach of a line and runs roughly along it; squares save the roots.
+WIDE void look_beside(const double* x, const double* y, const double* normal_x, const double* normal_y, int n,
+                      double a, double b, double c, double reach_cm, double roughly, std::uint8_t* beside) {
+  const double a2 = 2.0 * a, reach2 = reach_cm * reach_cm, roughly2 = roughly * roughly;
   for (int i = 0; i < n; ++i) {
-    const double slope = a2 * y[i] + b, across = 1.0 / std::sqrt(1.0 + slope * slope);
-    off[i] = (x[i] - ((a * y[i] + b) * y[i] + c)) * across;
-    agree[i] = (normal_x[i] - normal_y[i] * slope) * across;
+    const double slope = a2 * y[i] + b, steep = 1.0 + slope * slope;
+    const double off = x[i] - ((a * y[i] + b) * y[i] + c), facing = normal_x[i] - normal_y[i] * slope;
+    beside[i] = (off * off < reach2 * steep) & (facing * facing > roughly2 * steep);
   }
 }
 
 // RoadBorders.beside() of one line.
 void choose(const Numbers& s, const Parabola& line, double reach_cm, Near& near, Beside& out) {
   const int n = near.count;
-  measure_off(near.x.data(), near.y.data(), near.normal_x.data(), near.normal_y.data(), n, line.a, line.b, line.c,
-              near.off.data(), near.agree.data());
+  look_beside(near.x.data(), near.y.data(), near.normal_x.data(), near.normal_y.data(), n, line.a, line.b, line.c,
+              reach_cm, s.roughly, near.beside.data());
   int* index = near.index.data();
   int count = 0;
   for (int i = 0; i < n; ++i) {
     index[count] = i;
-    count += (std::abs(near.off[i]) < reach_cm) & (std::abs(near.agree[i]) > s.roughly);
+    count += near.beside[i];
   }
   if (count > kMost) {
     double* chosen = near.chosen.data();
@@ -182,11 +185,20 @@ WIDE void weigh_looks(const Numbers& s, double sign, double yellow, double red, 
     for (int i = 0; i < e.n; ++i) e.at[k][i] = (e.y[i] * s.basis[k][0] + s.basis[k][1]) * e.y[i] + s.basis[k][2];
 }
 
+// Lists the edge points with a weight: sums over them take no branch that is hard to guess.
+WITHIN int list_active(Beside& e) {
+  int count = 0;
+  for (int i = 0; i < e.n; ++i) {
+    e.active[count] = i;
+    count += e.weight[i] != 0.0;
+  }
+  return count;
+}
+
 // Gaps to the borders of a marking along a parabola, and the weights of those within the gate.
 WIDE int weigh_parabola(const Numbers& s, const Parabola& line, double marking, double gate, double cauchy,
                         Beside& e) {
   const double a2 = 2.0 * line.a;
-  int count = 0;
   for (int i = 0; i < e.n; ++i) {
     const double y = e.y[i], slope = a2 * y + line.b, across = 1.0 / std::sqrt(1.0 + slope * slope);
     const double agree = (e.normal_x[i] - e.normal_y[i] * slope) * across;
@@ -198,9 +210,8 @@ WIDE int weigh_parabola(const Numbers& s, const Parabola& line, double marking, 
     e.agree[i] = side;
     e.gap[i] = gap;
     e.weight[i] = near ? e.certain[i] / (1.0 + share * share) : 0.0;
-    count += near;
   }
-  return count;
+  return list_active(e);
 }
 
 // The same along a line that bends.
@@ -210,7 +221,6 @@ WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, doubl
     e.bent[i] = e.share[0][i] * here[0] + e.share[1][i] * here[1];
     e.weight[i] = e.lean[0][i] * here[0] + e.lean[1][i] * here[1];
   }
-  int count = 0;
   for (int i = 0; i < e.n; ++i) {
     const double steep = e.slope[i] + e.weight[i], across = 1.0 / std::sqrt(1.0 + steep * steep);
     const double agree = (e.normal_x[i] - e.normal_y[i] * steep) * across;
@@ -223,9 +233,43 @@ WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, doubl
     e.agree[i] = agree;
     e.gap[i] = gap;
     e.weight[i] = near ? e.certain[i] / (1.0 + far * far) : 0.0;
-    count += near;
   }
-  return count;
+  return list_active(e);
+}
+
+// Adds a point's share to the normal equations of the parabola: four numbers side by side.
+WITHIN void add_outer(const double* change, double weight, double gap, double (*told)[4], double* gaps) {
+  double weighted[4];
+  for (int k = 0; k < 4; ++k) weighted[k] = change[k] * weight;
+  for (int k = 0; k < 4; ++k) gaps[k] += weighted[k] * gap;
+  for (int k = 0; k < 4; ++k)
+    for (int j = 0; j < 4; ++j) told[k][j] += weighted[k] * change[j];
+}
+
+// Adds those of all points to the normal equations of the bend. Neighbours mostly lie between the same two nodes,
+// whose sums meanwhile are at hand.
+WITHIN void add_bent(const Beside& e, int count, double crowd, double* pull, double (*told)[kNodes]) {
+  for (int k = 0; k < count;) {
+    const int node = e.node[e.active[k]];
+    double near_pull = pull[node], far_pull = pull[node + 1];
+    double near_near = told[node][node], near_far = told[node][node + 1];
+    double far_near = told[node + 1][node], far_far = told[node + 1][node + 1];
+    for (; k < count && e.node[e.active[k]] == node; ++k) {
+      const int i = e.active[k];
+      const double across = e.across[i], weight = e.weight[i] / crowd * across;
+      const double gap = e.gap[i] + e.bent[i] * across, near = e.share[0][i], far = e.share[1][i];
+      const double near_weight = near * weight, far_weight = far * weight;
+      near_pull += near_weight * gap;
+      far_pull += far_weight * gap;
+      near_near += near_weight * across * near;
+      near_far += near_weight * across * far;
+      far_near += far_weight * across * near;
+      far_far += far_weight * across * far;
+    }
+    pull[node] = near_pull, pull[node + 1] = far_pull;
+    told[node][node] = near_near, told[node][node + 1] = near_far;
+    told[node + 1][node] = far_near, told[node + 1][node + 1] = far_far;
+  }
 }
 
 // _refine() of one line, whose edge points are in `e`.
@@ -256,16 +300,12 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
     }
     const double crowd = std::max(1.0, count / s.independent);
     double told[4][4] = {}, gaps[4] = {};
-    for (int i = 0; i < e.n; ++i) {
-      if (e.weight[i] == 0.0) continue;
+    for (int k = 0; k < count; ++k) {
+      const int i = e.active[k];
       const double weight = e.weight[i] / crowd;
       const double change[4] = {e.at[0][i] * -e.across[i], e.at[1][i] * -e.across[i], e.at[2][i] * -e.across[i],
                                 0.5 * e.agree[i]};
-      for (int k = 0; k < 4; ++k) {
-        const double weighted = change[k] * weight;
-        gaps[k] += weighted * e.gap[i];
-        for (int j = 0; j < 4; ++j) told[k][j] += weighted * change[j];
-      }
+      add_outer(change, weight, e.gap[i], told, gaps);
     }
     double off[4], pull[4], moved[4];
     for (int k = 0; k < 4; ++k) off[k] = start[k] - found[k];
@@ -296,14 +336,17 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
     const double y = e.y[i];
     e.slope[i] = a2 * y + line.b;
     e.beyond[i] = e.x[i] - ((line.a * y + line.b) * y + line.c);
-    e.node[i] = std::clamp(static_cast<int>((y - s.nodes_cm[0]) / s.node_cm), 0, kNodes - 2);
-    for (int k = 0; k < 2; ++k) {
-      const double ahead = (s.nodes_cm[e.node[i] + k] - y) / s.node_cm;
-      e.share[k][i] = std::max(1.0 - std::abs(ahead), 0.0);
-      e.lean[k][i] = e.share[k][i] > 0.0 ? sign_of(ahead) / s.node_cm : 0.0;
-    }
+    const int node = static_cast<int>((y - s.nodes_cm[0]) / s.node_cm);
+    e.node[i] = node < 0 ? 0 : node > kNodes - 2 ? kNodes - 2 : node;
+    e.bin[i] = static_cast<int>((y - s.near_cm) / s.bin_cm);
     e.gate[i] = s.bent_first_cm;
   }
+  for (int k = 0; k < 2; ++k)
+    for (int i = 0; i < e.n; ++i) {
+      const double ahead = (s.nodes_cm[e.node[i] + k] - e.y[i]) / s.node_cm, share = 1.0 - std::abs(ahead);
+      e.share[k][i] = share > 0.0 ? share : 0.0;
+      e.lean[k][i] = share > 0.0 ? sign_of(ahead) / s.node_cm : 0.0;
+    }
   double bent_information[kNodes][kNodes], covariance[kNodes][kNodes], off[kRows], pulled[kRows];
   double wanted[kNodes] = {}, extra[kNodes] = {}, reach[kNodes];
   std::memcpy(bent_information, s.smooth, sizeof bent_information);
@@ -319,17 +362,7 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
     const double crowd = std::max(1.0, count / s.independent);
     double pull[kNodes] = {};
     std::memset(covariance, 0, sizeof covariance);
-    for (int i = 0; i < e.n; ++i) {
-      if (e.weight[i] == 0.0) continue;
-      const double across = e.across[i], weight = e.weight[i] / crowd * across;
-      const double gap = e.gap[i] + e.bent[i] * across;
-      const int node = e.node[i];
-      for (int k = 0; k < 2; ++k) {
-        const double weighted = e.share[k][i] * weight, again = weighted * across;
-        pull[node + k] += weighted * gap;
-        for (int j = 0; j < 2; ++j) covariance[node + k][node + j] += again * e.share[j][i];
-      }
-    }
+    add_bent(e, count, crowd, pull, covariance);
     for (int i = 0; i < kNodes; ++i) {
       pull[i] += wanted[i];
       for (int j = 0; j < kNodes; ++j) covariance[i][j] = bent_information[i][j] + covariance[i][j];
@@ -344,14 +377,16 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
   weigh_bent(s, found[3], extra, e.gate, e);
   bool seen[2][kMostBins] = {};
   const int bins = static_cast<int>((s.far_cm - s.near_cm) / s.bin_cm) + 1;
-  int met = 0, total = 0, filled = 0, first = bins, last = 0;
+  int total = 0, filled = 0, first = bins, last = 0;
   double yellow = 0.0, red = 0.0;
-  for (int i = 0; i < e.n; ++i) {
-    if (!(std::abs(e.agree[i]) > s.cosine && std::abs(e.gap[i]) < s.seen_cm)) continue;
-    ++met;
+  for (int i = 0; i < e.n; ++i)
+    e.weight[i] = (std::abs(e.agree[i]) > s.cosine) & (std::abs(e.gap[i]) < s.seen_cm) ? 1.0 : 0.0;
+  const int met = list_active(e);
+  for (int k = 0; k < met; ++k) {
+    const int i = e.active[k];
     yellow += e.yellow[i];
     red += e.red[i];
-    seen[e.agree[i] > 0.0][static_cast<int>((e.y[i] - s.near_cm) / s.bin_cm)] = true;
+    seen[e.agree[i] > 0.0][e.bin[i]] = true;
   }
   for (int i = 0; i < bins; ++i) {
     total += seen[0][i] + seen[1][i];
@@ -416,14 +451,13 @@ PyObject* refuse(const char* what) {
 }
 
 PyObject* refine(PyObject*, PyObject* args) {
-  Buffer points, sigma, marking, marking_sigma, hues, edges, normals, edge_hues, numbers;
+  Buffer asked, edges, normals, edge_hues, numbers;
   int single;
-  if (!PyArg_ParseTuple(args, "y*y*y*y*y*y*y*z*y*p", &points.view, &sigma.view, &marking.view, &marking_sigma.view,
-                        &hues.view, &edges.view, &normals.view, &edge_hues.view, &numbers.view, &single))
+  if (!PyArg_ParseTuple(args, "y*y*y*z*y*p", &asked.view, &edges.view, &normals.view, &edge_hues.view, &numbers.view,
+                        &single))
     return nullptr;
-  const size_t m = marking.size();
-  if (points.size() != 3 * m || sigma.size() != 3 * m || marking_sigma.size() != m || hues.size() != 2 * m)
-    return refuse("lines: points, sigmas, markings and hues differ in number");
+  if (asked.size() % kAsked) return refuse("lines: points, sigmas, markings and hues differ in number");
+  const size_t m = asked.size() / kAsked;
   const size_t pair = 2 * (single ? sizeof(float) : sizeof(double));
   if (edges.view.len % pair || normals.view.len != edges.view.len ||
       (edge_hues.view.buf && edge_hues.view.len != edges.view.len))
@@ -450,16 +484,15 @@ PyObject* refine(PyObject*, PyObject* args) {
     };
     if (single) take(float{});
     else take(double{});
-    double widest = 0.0;
-    for (size_t i = 0; i < m; ++i) widest = std::max(widest, std::abs(marking.data()[i]));
     const bool any = near.count >= s.least;
     for (size_t i = 0; i < m; ++i) {
+      const double* line = asked.data() + kAsked * i;
+      const double marking = line[6];
       if (any) {
-        choose(s, parabola_of(s, points.data() + 3 * i), s.first_cm + s.bent_cm + widest, near, beside);
-        weigh_looks(s, sign_of(marking.data()[i]), hues.data()[2 * i], hues.data()[2 * i + 1], beside);
+        choose(s, parabola_of(s, line), s.first_cm + s.bent_cm + std::abs(marking), near, beside);
+        weigh_looks(s, sign_of(marking), line[8], line[9], beside);
       }
-      refine_line(s, points.data() + 3 * i, sigma.data() + 3 * i, marking.data()[i], marking_sigma.data()[i], any,
-                  beside, out + kPerLine * i);
+      refine_line(s, line, line + 3, marking, line[7], any, beside, out + kPerLine * i);
     }
     return result;
   } catch (const std::exception&) {

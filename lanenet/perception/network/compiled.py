@@ -28,24 +28,19 @@ def is_here() -> bool:
 
 
 def refine(
-    lines: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    edges: RoadEdges,
-    numbers: Float[np.ndarray, "n"],
+    asked: Float[np.ndarray, "m 10"], edges: RoadEdges, numbers: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "m 14"]:
-    """Fit lines to edge points as :func:`lanenet.perception.network.refinement.refine_lines` does.
+    """Fit lines to edge points as :func:`lanenet.perception.network.refinement.refined` does.
 
     Args:
-        lines: Points, their sigmas, widths of the markings, their sigmas, and hues.
+        asked: Of each line what is known before.
         edges: The frame's edge points, all float32 or all float64.
         numbers: The settings, in the order of ``Numbers`` in ``_kernels.cpp``.
-
-    Returns:
-        Of each line the points, their sigmas, the width, the length seen, where it is seen, and its look.
     """
-    given = [np.ascontiguousarray(x, np.float64) for x in lines]
     looks = edges.points_cm, edges.normals, edges.hues
     seen = [None if x is None else np.ascontiguousarray(x) for x in looks]
-    found = _kernels.refine(*given, *seen, numbers, edges.points_cm.dtype == np.float32)
+    lines = np.ascontiguousarray(asked, np.float64)
+    found = _kernels.refine(lines, *seen, numbers, edges.points_cm.dtype == np.float32)
     return np.frombuffer(found).reshape(-1, _PER_LINE)
 
 

@@ -151,11 +151,16 @@ class RoadBorders:
         return (edges.x - x_cm) * across, (edges.normal_x - edges.normal_y * slope) * across
 
     def beside(
-        self, points_cm: Float[np.ndarray, "m 3"], reach_cm: float
+        self, points_cm: Float[np.ndarray, "m 3"], reach_cm: Float[np.ndarray, "m"]
     ) -> tuple[Int[np.ndarray, "m k"], Bool[np.ndarray, "m k"]]:
         """Indices of the edge points near each line, at most ``_MOST`` of them; false beyond their number."""
-        off_cm, agree = self.off_cm(points_cm)
-        key = np.where((np.abs(off_cm) < reach_cm) & (np.abs(agree) > _ROUGHLY), self.near.key, 2.0)
+        edges = self.near
+        x_cm, slope = line_at(points_cm, edges.y)
+        # As of off_cm(), but squares save the roots.
+        steep, off = 1.0 + slope * slope, edges.x - x_cm
+        facing, reach2 = edges.normal_x - edges.normal_y * slope, (reach_cm * reach_cm)[:, None]
+        near = (off * off < reach2 * steep) & (facing * facing > _ROUGHLY * _ROUGHLY * steep)
+        key = np.where(near, edges.key, 2.0)
         most = min(_MOST, key.shape[1])
         index = np.sort(np.argpartition(key, most - 1, axis=1)[:, :most], axis=1)
         return index, np.take_along_axis(key, index, axis=1) < 1.5
@@ -194,31 +199,38 @@ def refine_lines(
     """
     if hues is None:
         hues = np.full((len(points_cm), 2), np.nan)
-    lines = points_cm, sigma_cm, marking_cm, marking_sigma_cm, hues
-    if not compiled.is_here():
-        return _refine(*lines, borders)
-    found = compiled.refine(lines, borders.edges, _NUMBERS)
+    found = refined(np.column_stack([points_cm, sigma_cm, marking_cm, marking_sigma_cm, hues]), borders)
     return RefinedLines(
         found[:, :3], found[:, 3:6], found[:, 6], found[:, 7], found[:, 8:11] > 0.0, found[:, 11:]
     )
 
 
-def _refine(
-    points_cm: Float[np.ndarray, "m 3"],
-    sigma_cm: Float[np.ndarray, "m 3"],
-    marking_cm: Float[np.ndarray, "m"],
-    marking_sigma_cm: Float[np.ndarray, "m"],
-    hues: Float[np.ndarray, "m 2"],
-    borders: RoadBorders,
-) -> RefinedLines:
-    """Do :func:`refine_lines` without compiled loops; every sum is taken in the order in which they do."""
+def refined(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> Float[np.ndarray, "m 14"]:
+    """Do :func:`refine_lines` for a table of lines, each apart from the others.
+
+    Args:
+        asked: Of each line its points, their sigmas, the marking's width and its sigma, and its two hues.
+        borders: The frame's edge points.
+
+    Returns:
+        Of each line what :class:`RefinedLines` holds, in that order.
+    """
+    if compiled.is_here():
+        return compiled.refine(asked, borders.edges, _NUMBERS)
+    return np.column_stack(_refine(asked, borders))
+
+
+def _refine(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> RefinedLines:
+    """Do :func:`refined` without compiled loops; every sum is taken in the order in which they do."""
+    points_cm, sigma_cm, hues = asked[:, :3], asked[:, 3:6], asked[:, 8:]
+    marking_cm, marking_sigma_cm = asked[:, 6], asked[:, 7]
     edges, m = borders.near, len(points_cm)
     prior = sigma_cm[:, :, None] * sigma_cm[:, None, :] * _ROW_CORRELATION + _LEAST_VARIANCE * np.eye(3)
     by_prior = _inverse(prior)
     start = np.concatenate([points_cm, marking_cm[:, None]], axis=1)
     if len(edges.x) < _LEAST:
         return _unseen(start, prior)
-    index, there = borders.beside(points_cm, _FIRST_CM + _BENT_CM + float(np.abs(marking_cm).max()))
+    index, there = borders.beside(points_cm, _FIRST_CM + _BENT_CM + np.abs(marking_cm))
     x, y, normal_x, normal_y = (each[index] for each in edges[:4])
     spread_cm = _EDGE_CM + _EDGE_GROWTH * np.maximum(y, 0.0)
     certain = there / (spread_cm * spread_cm)
