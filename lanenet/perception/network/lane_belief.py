@@ -31,6 +31,7 @@ _SOLID = 0.05
 _PLAIN, _KEPT = 0.3, 0.95
 #: Difference of hues that is common within one marking. Tried from 0.15 to 0.25.
 _HUE_SIGMA = 0.25
+_NO_HUES = math.nan, math.nan
 
 
 def _last() -> RollingMedian:
@@ -39,11 +40,12 @@ def _last() -> RollingMedian:
 
 @dataclass
 class _Line:
-    """What the last frames show of one line."""
+    """What the last frames show of one line; its hues are medians, NaN until enough of them showed it."""
 
     yellow: RollingMedian = field(default_factory=_last)
     red: RollingMedian = field(default_factory=_last)
     gaps: deque[float] = field(default_factory=lambda: deque(maxlen=_LENGTH))
+    hues: tuple[float, float] = _NO_HUES
 
     @property
     def known(self) -> bool:
@@ -82,6 +84,8 @@ class LineLooks:
         line.yellow.append(yellow)
         line.red.append(red)
         line.gaps.append(gaps)
+        if line.known:
+            line.hues = line.yellow.median, line.red.median
 
     def judge(self) -> None:
         """Weigh what both lines look like, once per frame."""
@@ -111,9 +115,7 @@ class LineLooks:
 
     def hues(self, side: int | None) -> tuple[float, float]:
         """Return by how much a line is yellower and redder than the floor; NaN while unknown, or of none."""
-        if side is None or not self._lines[side].known:
-            return math.nan, math.nan
-        return self._lines[side].yellow.median, self._lines[side].red.median
+        return _NO_HUES if side is None else self._lines[side].hues
 
     def unlike(self, side: int | None, look: Sequence[float]) -> float:
         """Return how surely a marking is another one than a line, by its hue: 0 to 1, 0 while unknown."""

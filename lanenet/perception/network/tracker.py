@@ -9,7 +9,7 @@ seen. Where nearly as much speaks for a pair in the next lane, nothing is answer
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from lanenet.perception.estimate import SEEN, SURE, LaneMemory
 from lanenet.perception.network import compiled
 from lanenet.perception.network.lane_belief import Keep, LineLooks
 from lanenet.perception.network.line_beside import SeenLine, line_beside
-from lanenet.perception.network.refinement import BASIS, RefinedLines, RoadBorders, line_at, refine_lines
+from lanenet.perception.network.refinement import BASIS, RoadBorders, line_at, refined
 from lanenet.perception.network.straight_on import SeenLines, StraightOn
 from lanenet.perception.rolling_median import RollingMedian
 
@@ -113,7 +113,8 @@ class _Start(NamedTuple):
     """Where a line may be: at most that surely, and what speaks for it before the edges were looked at.
 
     A line is known as the left one, 0, or the right one, 1, if it should look like that; as None it may have
-    any look. The presence is the network's, of the lines that it sees itself.
+    any look. The presence is the network's, of the lines that it sees itself. One that is measured shows how
+    wide its marking is, and what was learned of that has no say.
     """
 
     side: int
@@ -123,6 +124,23 @@ class _Start(NamedTuple):
     known_as: int | None
     presence: float = 0.0
     beyond: bool = False
+    measured: bool = False
+
+
+class _Found(NamedTuple):
+    """A line on its marking: see :class:`lanenet.perception.network.refinement.RefinedLines`."""
+
+    points_cm: list[float]
+    sigma_cm: list[float]
+    marking_cm: float
+    seen_cm: float
+    seen_at: list[bool]
+    look: list[float]
+
+    @classmethod
+    def of_row(cls, row: list[float]) -> _Found:
+        """Take a row of what :func:`lanenet.perception.network.refinement.refined` returns."""
+        return cls(row[:3], row[3:6], row[6], row[7], list(map(bool, row[8:11])), row[11:])
 
 
 class _Candidate(NamedTuple):
@@ -187,48 +205,51 @@ class LaneTracker:
             Points and sigmas, NaN where the place is unknown, and the length along the road in which each
             line was seen, [cm].
         """
-        own = _both(points_cm), _both(_NETWORK_SIGMA * sigma_cm)
+        network_cm = points_cm.tolist()
+        own = _both(network_cm), _both((_NETWORK_SIGMA * sigma_cm).tolist())
         present = presence.tolist()
         borders = RoadBorders(edges)
-        pair, decided = self._best_pair(self._candidates(own, present, borders))
+        starts, measured = self._starts(own, present), self._to_measure(own, present)
+        # In one go, since each look at the edge points has a price.
+        found = self._refine([*starts, *measured], borders)
+        pair, decided = self._best_pair(self._candidates(starts, found, own, present))
         if self._at_junction(pair, present, borders):
-            continued_cm, continued_sigma_cm = self.straight_on.lane()
-            self._last = continued_cm.tolist(), continued_sigma_cm.tolist()
-            return (*self._known(continued_cm.ravel(), continued_sigma_cm.ravel()), np.zeros(len(SIDES)))
+            continued_cm, continued_sigma_cm = (x.ravel().tolist() for x in self.straight_on.lane())
+            self._last = _both(continued_cm), _both(continued_sigma_cm)
+            return (*self._known(continued_cm, continued_sigma_cm, continued_cm), np.zeros(len(SIDES)))
         self._notice_change(pair)
-        self._measure_markings(own, present, pair, borders)
+        self._learn_markings(pair, zip(measured, found[len(starts) :], strict=True))
         for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
                 self.looks.remember(side, line.look)
         self.looks.judge()
         left, right = pair
-        found_cm = np.array(left.points_cm + right.points_cm)
-        found_sigma_cm = np.array(_sigma_cm(left) + _sigma_cm(right))
+        found_cm, found_sigma_cm = left.points_cm + right.points_cm, _sigma_cm(left) + _sigma_cm(right)
         self._recall_near(pair, found_cm, found_sigma_cm)
         seen = [line.seen_cm >= _LINE_SEEN_CM for line in pair]
         if seen[0] != seen[1]:
             side = seen.index(True)
             self._tell_other(side, pair[side], found_cm, found_sigma_cm, edges)
         self._last = _both(found_cm), _both(found_sigma_cm)
-        if (doubts := self.straight_on.doubts(found_cm, self.lane.width_cm)) is not None:
-            found_sigma_cm[doubts] = np.inf
+        if (doubts := self.straight_on.doubts(np.array(found_cm), self.lane.width_cm)) is not None:
+            found_sigma_cm = np.where(doubts, math.inf, found_sigma_cm).tolist()
         for side, line in enumerate(pair):
             # A solid line that is not seen ahead turns away there, or ends.
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
-                found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = np.inf
+                found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = math.inf
         if decided:
             self._arrive(pair, present)
         if not decided or self._side_is_a_guess(present):
-            found_sigma_cm[:] = np.inf
-        known = self._known(found_cm, found_sigma_cm, points_cm)
+            found_sigma_cm = [math.inf] * len(found_cm)
+        known = self._known(found_cm, found_sigma_cm, network_cm)
         return (*known, np.array([left.seen_cm, right.seen_cm]))
 
     def _tell_other(
         self,
         side: int,
         line: _Candidate,
-        found_cm: Float[np.ndarray, "6"],
-        found_sigma_cm: Float[np.ndarray, "6"],
+        found_cm: list[float],
+        found_sigma_cm: list[float],
         edges: RoadEdges,
     ) -> None:
         """Take the lane's other line from the one of a side, where that alone is seen."""
@@ -237,18 +258,21 @@ class LaneTracker:
             return
         marking_cm = widths_cm.median if len(widths_cm) >= _ENOUGH else _MARKING_CM
         seen = SeenLine(side, np.array(line.points_cm), line.seen_at[-1], marking_cm)
-        told_cm = line_beside(seen, width_cm, edges)
-        known = np.isfinite(told_cm)
-        own, other = (slice(len(ROWS_CM) * i, len(ROWS_CM) * (i + 1)) for i in (side, 1 - side))
-        sigma_cm = np.hypot(found_sigma_cm[own], self.lane.width_sigma * width_cm)
-        found_cm[other] = np.where(known, told_cm, found_cm[other])
-        found_sigma_cm[other] = np.where(known, sigma_cm, np.inf)
+        own, other = len(ROWS_CM) * side, len(ROWS_CM) * (1 - side)
+        for i, told_cm in enumerate(line_beside(seen, width_cm, edges).tolist()):
+            if math.isnan(told_cm):
+                found_sigma_cm[other + i] = math.inf
+                continue
+            found_cm[other + i] = told_cm
+            found_sigma_cm[other + i] = math.hypot(
+                found_sigma_cm[own + i], self.lane.width_sigma * width_cm
+            )
 
     def _recall_near(
         self,
         pair: tuple[_Candidate, _Candidate],
-        found_cm: Float[np.ndarray, "6"],
-        found_sigma_cm: Float[np.ndarray, "6"],
+        found_cm: list[float],
+        found_sigma_cm: list[float],
     ) -> None:
         """Where a line passes out of view beside the car, fuse its place there with the last frame's."""
         if self._last is None:
@@ -258,47 +282,39 @@ class LaneTracker:
             if line.seen_cm < _LINE_SEEN_CM or line.seen_at[0] or off_cm > _RECALLED * self.lane.likely_cm:
                 continue
             beside = len(ROWS_CM) * side
-            found, recalled = float(found_sigma_cm[beside]) ** 2, _moved(last_sigma_cm)[0] ** 2
+            found, recalled = found_sigma_cm[beside] ** 2, _moved(last_sigma_cm)[0] ** 2
             gain = found / (found + recalled)
             found_cm[beside] += gain * (last_cm[0] - found_cm[beside])
             found_sigma_cm[beside] = math.sqrt(gain * recalled)
 
     def _known(
-        self,
-        points_cm: Float[np.ndarray, "6"],
-        sigma_cm: Float[np.ndarray, "6"],
-        own_cm: Float[np.ndarray, "6"] | None = None,
+        self, points_cm: list[float], sigma_cm: list[float], own_cm: list[float]
     ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
         """Return points and sigmas, NaN where the place is unknown; ``own_cm`` is the network's answer."""
-        most_cm, points, sigmas = _MOST_LANES * self.lane.likely_cm, points_cm.tolist(), sigma_cm.tolist()
-        own = points if own_cm is None else own_cm.tolist()
-        apart_cm = [abs(x - own_x) for x, own_x in zip(points, own, strict=True)]
-        for i, sigma in enumerate(sigmas):
+        most_cm, known_cm, known_sigma_cm = _MOST_LANES * self.lane.likely_cm, [], []
+        apart_cm = [abs(x - own_x) for x, own_x in zip(points_cm, own_cm, strict=True)]
+        for i, (x, sigma) in enumerate(zip(points_cm, sigma_cm, strict=True)):
             middle = i - i % len(ROWS_CM) + _MIDDLE
-            if math.hypot(sigma, max(apart_cm[i], apart_cm[middle])) > most_cm:
-                points[i] = sigmas[i] = math.nan
-        return np.array(points), np.array(sigmas)
+            known = math.hypot(sigma, max(apart_cm[i], apart_cm[middle])) <= most_cm
+            known_cm.append(x if known else math.nan)
+            known_sigma_cm.append(sigma if known else math.nan)
+        return np.array(known_cm), np.array(known_sigma_cm)
 
     def _candidates(
-        self, own: tuple[_Both, _Both], presence: list[float], borders: RoadBorders
+        self, starts: list[_Start], found: list[_Found], own: tuple[_Both, _Both], presence: list[float]
     ) -> tuple[list[_Candidate], list[_Candidate]]:
-        """Collect what the left and the right line may be; the last of each is the network's, as it is."""
-        starts = self._starts(own, presence)
+        """Rate what the left and the right line may be; the last of each is the network's, as it is."""
         candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
-        if starts:
-            sides, points, sigmas, _, known_as, _, _ = zip(*starts, strict=True)
-            refined = self._refine(points, sigmas, sides, known_as, borders)
-            fields = refined.points_cm, refined.sigma_cm, refined.seen_cm, refined.seen_at, refined.look
-            for start, points_cm, sigma_cm, seen_cm, seen_at, look in zip(
-                starts, *(field.tolist() for field in fields), strict=True
-            ):
-                if start.beyond and seen_cm < _BEYOND_SEEN_CM:
-                    continue
-                score_cm = start.score_cm
-                score_cm = seen_cm + score_cm if seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
-                score_cm -= _BY_LOOK_CM * self.looks.unlike(start.known_as, look)
-                line = points_cm, sigma_cm, seen_cm, score_cm, seen_at, look, start.presence
-                candidates[start.side].append(_Candidate(*line))
+        # Behind the lines that were looked for come those that are only measured.
+        for start, line in zip(starts, found, strict=False):
+            if start.beyond and line.seen_cm < _BEYOND_SEEN_CM:
+                continue
+            score_cm = start.score_cm
+            score_cm = line.seen_cm + score_cm if line.seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
+            score_cm -= _BY_LOOK_CM * self.looks.unlike(start.known_as, line.look)
+            points_cm, sigma_cm, _, seen_cm, seen_at, look = line
+            rated = _Candidate(points_cm, sigma_cm, seen_cm, score_cm, seen_at, look, start.presence)
+            candidates[start.side].append(rated)
         for side, lines in enumerate(candidates):
             doubt_cm = _BY_PRESENCE_CM * (presence[side] - 0.5)
             lines.append(_Candidate(own[0][side], own[1][side], 0.0, doubt_cm, _NOWHERE, _UNSEEN))
@@ -403,9 +419,9 @@ class LaneTracker:
             if not np.isfinite(beside_cm).all() or self._sees is None or not self._sees(beside_cm):
                 continue
             sigma_cm = _moved(line.sigma_cm)
-            found = self._refine([beside_cm.tolist()], [sigma_cm], [1 - side], [None], borders)
-            off_cm = np.abs(found.points_cm[0] - beside_cm).max()
-            if found.seen_at[0, -1] and found.seen_cm[0] >= _WIDTH_SEEN_CM and off_cm < _BESIDE * width_cm:
+            (found,) = self._refine([_Start(1 - side, beside_cm.tolist(), sigma_cm, 0.0, None)], borders)
+            off_cm = np.abs(found.points_cm - beside_cm).max()
+            if found.seen_at[-1] and found.seen_cm >= _WIDTH_SEEN_CM and off_cm < _BESIDE * width_cm:
                 return True, None, False
             if not other.seen_at[-1] or other.seen_cm < _LINE_SEEN_CM:
                 return False, side, presence[1 - side] < _ENDED
@@ -427,61 +443,53 @@ class LaneTracker:
                 self._markings_cm[side] = RollingMedian(_LENGTH)
                 return
 
-    def _measure_markings(
-        self,
-        own: tuple[_Both, _Both],
-        presence: list[float],
-        pair: tuple[_Candidate, _Candidate],
-        borders: RoadBorders,
-    ) -> None:
-        """Learn how wide the lane's markings are, and whether they are light, from the network's own lines.
+    def _to_measure(self, own: tuple[_Both, _Both], presence: list[float]) -> list[_Start]:
+        """Return the lines whose markings are measured in this frame: the network's own.
 
         What was learned has no say: else a wrong belief would find itself confirmed in every frame.
         """
-        self._frames += 1
         known = all(len(widths_cm) >= _ENOUGH for widths_cm in self._markings_cm)
-        if known and self._frames % _MEASURED_EVERY:
-            return
-        sides = [side for side in range(len(SIDES)) if presence[side] >= _LEAST_PRESENCE]
-        if not sides:
-            return
-        points, sigmas = ([lines[side] for side in sides] for lines in own)
-        found = self._refine(points, sigmas, sides, [None] * len(sides), borders, known=False)
-        for i, side in enumerate(sides):
-            off_cm = np.abs(found.points_cm[i] - pair[side].points_cm).max()
-            if found.seen_cm[i] >= _WIDTH_SEEN_CM and off_cm < _SAME * self.lane.likely_cm:
-                self._markings_cm[side].append(float(found.marking_cm[i]))
-
-    def _refine(
-        self,
-        points_cm: Sequence[list[float]],
-        sigma_cm: Sequence[list[float]],
-        sides: Sequence[int],
-        known_as: Sequence[int | None],
-        borders: RoadBorders,
-        known: bool = True,
-    ) -> RefinedLines:
-        """Refine lines; light or dark is tried until markings are known, and where they are not to count."""
-        counts = [known and len(widths_cm) >= _ENOUGH for widths_cm in self._markings_cm]
-        usual = [
-            widths_cm.median if enough else _MARKING_CM
-            for widths_cm, enough in zip(self._markings_cm, counts, strict=True)
+        if known and (self._frames + 1) % _MEASURED_EVERY:
+            return []
+        return [
+            _Start(side, own[0][side], own[1][side], 0.0, None, measured=True)
+            for side, present in enumerate(presence)
+            if present >= _LEAST_PRESENCE
         ]
-        marking = np.array([usual[side] for side in sides])
-        sigma = np.array([_KNOWN_SIGMA_CM if counts[side] else _MARKING_SIGMA_CM for side in sides])
-        hues = np.array([self.looks.hues(side) for side in known_as])
-        lines = np.array(points_cm), np.array(sigma_cm), borders
-        light = refine_lines(*lines, marking, sigma, hues)
-        if all(counts[side] for side in sides):
-            return light
-        dark = refine_lines(*lines, -marking, sigma, hues)
-        darker = (dark.seen_cm > light.seen_cm) & ~np.array([counts[side] for side in sides])
-        return RefinedLines(
-            *(
-                np.where(darker.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-                for a, b in zip(light, dark, strict=True)
-            )
-        )
+
+    def _learn_markings(
+        self, pair: tuple[_Candidate, _Candidate], measured: Iterable[tuple[_Start, _Found]]
+    ) -> None:
+        """Learn how wide the lane's markings are, and whether they are light, from what was measured."""
+        self._frames += 1
+        for start, found in measured:
+            both_cm = zip(found.points_cm, pair[start.side].points_cm, strict=True)
+            off_cm = max(abs(x - chosen_x) for x, chosen_x in both_cm)
+            if found.seen_cm >= _WIDTH_SEEN_CM and off_cm < _SAME * self.lane.likely_cm:
+                self._markings_cm[start.side].append(found.marking_cm)
+
+    def _refine(self, starts: Sequence[_Start], borders: RoadBorders) -> list[_Found]:
+        """Refine lines; light and dark are tried until markings are known, and where they are measured."""
+        asked, both = [], []
+        for start in starts:
+            widths_cm = self._markings_cm[start.side]
+            unknown = start.measured or len(widths_cm) < _ENOUGH
+            marking_cm = _MARKING_CM if unknown else widths_cm.median
+            sigma_cm = _MARKING_SIGMA_CM if unknown else _KNOWN_SIGMA_CM
+            hues = self.looks.hues(start.known_as)
+            for width_cm in (marking_cm, -marking_cm) if unknown else (marking_cm,):
+                asked.append([*start.points_cm, *start.sigma_cm, width_cm, sigma_cm, *hues])
+            both.append(unknown)
+        if not asked:
+            return []
+        rows = iter(map(_Found.of_row, refined(np.array(asked), borders).tolist()))
+        found = []
+        for tried_both in both:
+            line = next(rows)
+            if tried_both and (dark := next(rows)).seen_cm > line.seen_cm:
+                line = dark
+            found.append(line)
+        return found
 
     def _best_pair(
         self, candidates: tuple[list[_Candidate], list[_Candidate]]
@@ -529,9 +537,8 @@ class LaneTracker:
         return pairs[chosen], decided
 
 
-def _both(values: Float[np.ndarray, "6"]) -> _Both:
-    left_and_right = values.tolist()
-    return [left_and_right[: len(ROWS_CM)], left_and_right[len(ROWS_CM) :]]
+def _both(values: list[float]) -> _Both:
+    return [values[: len(ROWS_CM)], values[len(ROWS_CM) :]]
 
 
 def _moved(sigma_cm: list[float]) -> list[float]:
