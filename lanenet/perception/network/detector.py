@@ -17,8 +17,9 @@ from lanenet.geometry.lane import ROWS_CM, lane_width_cm, parabola_through, prop
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
+from lanenet.perception.network.first_layer import ANSWERS, open_network
 from lanenet.perception.network.lane_belief import Keep
-from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
+from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta
 from lanenet.perception.network.tracker import LaneTracker
 
 log = logging.getLogger(__name__)
@@ -89,7 +90,7 @@ class NetworkDetector:
             CalibrationError: If the mask's size is not the camera's.
             ModelMismatchError: If the file is not a model of this format, or was made for another camera.
         """
-        self._session, self.meta = open_model(model_path, threads, frames=1)
+        self._session, self.meta = open_network(model_path, threads)
         if not any_camera:
             _check_camera(self.meta, camera, model_path)
         widths_cm = [] if lane_width_cm is None else [lane_width_cm]
@@ -152,7 +153,7 @@ class NetworkDetector:
         """Run the network on the raster, with the lane's width as soon as it is known."""
         if self.meta.takes_width:
             self._feed[WIDTH_NAME] = np.array([self.memory.width_cm or 0.0], np.float32)
-        found = self._session.run(("points_cm", "sigma_cm", "presence"), self._feed)
+        found = self._session.run(ANSWERS, self._feed)
         points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
         return points_cm, sigma_cm, presence
 

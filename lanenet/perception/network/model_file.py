@@ -402,12 +402,30 @@ def open_model(
         ModelMismatchError: If the file is missing, was damaged or is not an ONNX file, its description is of
             another format or does not fit its own inputs and outputs, or it fails its self-test.
     """
-    # A command that runs no network starts without it.
-    import onnxruntime
+    return check_model(*read_model(path), threads, frames)
 
+
+def read_model(path: Path) -> tuple[bytes, str]:
+    """Return the bytes of a model file, or of that in a checkpoint folder, and its name for errors.
+
+    Raises:
+        ModelMismatchError: If it is missing, or was damaged.
+    """
     path = find_model(path)
     data = read_bytes(path, ModelMismatchError, _MAX_MODEL)
     _check_seal(data, str(path))
+    return data, str(path)
+
+
+def new_session(data: bytes, where: str, threads: int, frames: int | None) -> onnxruntime.InferenceSession:
+    """Open an ONNX file's bytes; the arguments are those of :func:`open_model`.
+
+    Raises:
+        ModelMismatchError: If onnxruntime does not take it.
+    """
+    # A command that runs no network starts without it.
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -416,29 +434,36 @@ def open_model(
         options.add_free_dimension_override_by_name(BATCH_NAME, frames)
     try:
         # The bytes, not the path: a model by its path may read further files.
-        session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        properties = session.get_modelmeta().custom_metadata_map
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has no common base class of its own
         reason = first_line(error)
-        raise ModelMismatchError(f"{path}: cannot be opened as an ONNX model ({reason})") from None
-    meta = ModelMeta.from_properties(properties, str(path))
+        raise ModelMismatchError(f"{where}: cannot be opened as an ONNX model ({reason})") from None
+
+
+def check_model(
+    data: bytes, where: str, threads: int, frames: int | None
+) -> tuple[onnxruntime.InferenceSession, ModelMeta]:
+    """Do :func:`open_model` for what :func:`read_model` read."""
+    session = new_session(data, where, threads, frames)
+    properties = session.get_modelmeta().custom_metadata_map
+    meta = ModelMeta.from_properties(properties, where)
     inputs = {i.name: (i.type, list(i.shape[1:])) for i in session.get_inputs()}
     shape = meta.planes, meta.window.rows, meta.window.columns
     expected = {INPUT_NAME: ("tensor(uint8)", [*shape])}
     if inputs != expected:
-        raise ModelMismatchError(f"{path}: inputs {inputs} do not fit its window, expected {expected}")
+        raise ModelMismatchError(f"{where}: inputs {inputs} do not fit its window, expected {expected}")
     takes_width = WIDTH_NAME in {i.name for i in session.get_overridable_initializers()}
     if takes_width != meta.takes_width:
         has = "has an" if takes_width else "has no"
         raise ModelMismatchError(
-            f"{path}: {has} input {WIDTH_NAME}, but its description says takes_width: {meta.takes_width}"
+            f"{where}: {has} input {WIDTH_NAME}, but its description says takes_width: {meta.takes_width}"
         )
     outputs = [o.name for o in session.get_outputs()]
     if not set(OUTPUT_NAMES) <= set(outputs):
-        raise ModelMismatchError(f"{path}: outputs {outputs}, expected {list(OUTPUT_NAMES)}")
+        raise ModelMismatchError(f"{where}: outputs {outputs}, expected {list(OUTPUT_NAMES)}")
     if SELF_TEST_NAME not in properties:
-        raise ModelMismatchError(f"{path}: property {SELF_TEST_NAME!r} is missing; {_REMEDY}")
-    _run_self_test(session, properties[SELF_TEST_NAME], shape, str(path))
+        raise ModelMismatchError(f"{where}: property {SELF_TEST_NAME!r} is missing; {_REMEDY}")
+    _run_self_test(session, properties[SELF_TEST_NAME], shape, where)
     return session, meta
 
 
