@@ -19,7 +19,8 @@
 
 namespace {
 
-constexpr size_t kMost = 1024;  // widths that are told apart
+constexpr size_t kMost = 1024;                 // widths that are told apart
+constexpr double kLost = 1.0 / (1ull << 60);  // far less than what a sum in double precision keeps
 
 // The memory of an argument; released at the end.
 struct Buffer {
@@ -58,11 +59,14 @@ PyObject* learn(PyObject*, PyObject* args) {
                         &sigma, &own_share, &others, &kept, &alike))
     return nullptr;
   const size_t n = nats.view.len / sizeof(double);
+  const double log_others = std::log(others);
   if (n < 1 || !nats.holds(n) || !prior.holds(n) || !logs.holds(n) || !probability.holds(n))
     return refuse("belief: arrays differ in number");
   for (size_t i = 0; i < n; ++i) {
     const double off = (logs.data()[i] - log_width) / sigma;
-    const double likely = std::log(own_share * std::exp(-0.5 * (off * off)) + others);
+    const double share = own_share * std::exp(-0.5 * (off * off));
+    // Where the share is lost in rounding, which is so for most widths, the logarithm is known.
+    const double likely = share < kLost * others ? log_others : std::log(share + others);
     const double told = kept * (nats.data()[i] - prior.data()[i]) + likely / alike;
     nats.data()[i] = prior.data()[i] + told;
   }

@@ -254,9 +254,12 @@ class LaneMemory:
         if left <= SURE or right <= SURE:
             return
         width_cm = lane_width_cm(points_cm)
-        if 0.0 < width_cm < math.inf:
-            self._widths_cm.append(width_cm)
+        if not 0.0 < width_cm < math.inf:
+            return
+        if self.given_cm is None:
             self.belief.learn(width_cm)
+        else:
+            self._widths_cm.append(width_cm)
 
     def doubt(self) -> None:
         """Keep the width with little weight, as after a gap in a recording."""

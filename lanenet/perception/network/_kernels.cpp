@@ -62,7 +62,7 @@ struct Near {
 // Edge points of one line.
 struct Beside {
   double x[kMost], y[kMost], normal_x[kMost], normal_y[kMost], yellow[kMost], red[kMost], certain[kMost];
-  double at[kRows][kMost], slope[kMost], beyond[kMost], across[kMost], agree[kMost], gap[kMost];
+  double at[kRows][kMost], change[kMost][kRows + 1], slope[kMost], beyond[kMost], across[kMost], agree[kMost], gap[kMost];
   double weight[kMost], gate[kMost], share[2][kMost], lean[2][kMost], bent[kMost];
   // Node before each, bin in which it lies, and those that count at present.
   int node[kMost], bin[kMost], active[kMost], n;
@@ -88,13 +88,15 @@ inline double sign_of(double x) { return (x > 0.0) - (x < 0.0); }
 template <int n>
 WITHIN void invert(double (*m)[n]) {
   for (int i = 0; i < n; ++i) {
-    double row[n], column[n];
+    double row[n];
     const double scale = 1.0 / m[i][i];
-    for (int j = 0; j < n; ++j) row[j] = m[i][j] * scale, column[j] = m[j][i];
+    for (int j = 0; j < n; ++j) row[j] = m[i][j] * scale;
     row[i] = scale;
-    for (int k = 0; k < n; ++k) m[k][i] = 0.0;
-    for (int k = 0; k < n; ++k)
-      for (int j = 0; j < n; ++j) m[k][j] -= column[k] * row[j];
+    for (int k = 0; k < n; ++k) {
+      const double column = m[k][i];
+      m[k][i] = 0.0;
+      for (int j = 0; j < n; ++j) m[k][j] -= column * row[j];
+    }
     for (int j = 0; j < n; ++j) m[i][j] = row[j];
   }
 }
@@ -140,6 +142,23 @@ WIDE void look_beside(const double* x, const double* y, const double* normal_x, 
   }
 }
 
+// The smallest key above kMost others, of the first `count` points in `index`: keys are spread evenly from 0 to 1, so
+// that of as many bins only one is sorted.
+double smallest_key(Near& near, int count) {
+  int filled[kMost + 1] = {};
+  for (int k = 0; k < count; ++k) ++filled[static_cast<int>(near.key[near.index[k]] * kMost)];
+  int bin = 0, below = 0;
+  while (below + filled[bin] <= kMost) below += filled[bin++];
+  double* there = near.chosen.data();
+  int n = 0;
+  for (int k = 0; k < count; ++k) {
+    there[n] = near.key[near.index[k]];
+    n += static_cast<int>(there[n] * kMost) == bin;
+  }
+  std::nth_element(there, there + (kMost - below), there + n);
+  return there[kMost - below];
+}
+
 // RoadBorders.beside() of one line.
 void choose(const Numbers& s, const Parabola& line, double reach_cm, Near& near, Beside& out) {
   const int n = near.count;
@@ -152,15 +171,11 @@ void choose(const Numbers& s, const Parabola& line, double reach_cm, Near& near,
     count += near.beside[i];
   }
   if (count > kMost) {
-    double* chosen = near.chosen.data();
-    for (int k = 0; k < count; ++k) chosen[k] = near.key[index[k]];
-    std::nth_element(chosen, chosen + kMost, chosen + count);
-    const double most = chosen[kMost];
+    const double most = smallest_key(near, count);
     int left = 0;
     for (int k = 0; k < count; ++k) {
-      const int i = index[k];
-      index[left] = i;
-      left += near.key[i] < most;
+      index[left] = index[k];
+      left += near.key[index[k]] < most;
     }
     count = left;
   }
@@ -201,27 +216,36 @@ WITHIN int list_active(Beside& e) {
   return count;
 }
 
+// The same, and divides the weights where more points than are independent share them.
+WITHIN int share_weights(const Numbers& s, Beside& e) {
+  const int count = list_active(e);
+  const double crowd = count / s.independent;
+  for (int i = 0; crowd > 1.0 && i < e.n; ++i) e.weight[i] /= crowd;
+  return count;
+}
+
 // Gaps to the borders of a marking along a parabola, and the weights of those within the gate.
 WIDE int weigh_parabola(const Numbers& s, const Parabola& line, double marking, double gate, double cauchy,
                         Beside& e) {
-  const double a2 = 2.0 * line.a;
+  const double a2 = 2.0 * line.a, per_cauchy = 1.0 / cauchy;
   for (int i = 0; i < e.n; ++i) {
     const double y = e.y[i], slope = a2 * y + line.b, across = 1.0 / std::sqrt(1.0 + slope * slope);
     const double agree = (e.normal_x[i] - e.normal_y[i] * slope) * across;
     const double side = agree > 0.0 ? 1.0 : agree < 0.0 ? -1.0 : 0.0;
     const double gap = (e.x[i] - ((line.a * y + line.b) * y + line.c)) * across + 0.5 * side * marking;
     const bool near = (std::abs(agree) > s.cosine) & (std::abs(gap) < gate);
-    const double share = gap / cauchy;
-    e.across[i] = across;
-    e.agree[i] = side;
+    const double share = gap * per_cauchy;
+    for (int k = 0; k < kRows; ++k) e.change[i][k] = e.at[k][i] * -across;
+    e.change[i][kRows] = 0.5 * side;
     e.gap[i] = gap;
     e.weight[i] = near ? e.certain[i] / (1.0 + share * share) : 0.0;
   }
-  return list_active(e);
+  return share_weights(s, e);
 }
 
 // The same along a line that bends.
 WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, double* gate, Beside& e) {
+  const double per_cauchy = 1.0 / s.cauchy_cm;
   for (int i = 0; i < e.n; ++i) {
     const double *here = extra + e.node[i];
     e.bent[i] = e.share[0][i] * here[0] + e.share[1][i] * here[1];
@@ -234,13 +258,13 @@ WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, doubl
     const double gap = (e.beyond[i] - e.bent[i]) * across + 0.5 * side * marking;
     const double cosine = gate[i] > s.loose_cm ? s.roughly : s.cosine;
     const bool near = (std::abs(agree) > cosine) & (std::abs(gap) < gate[i]);
-    const double far = gap / s.cauchy_cm;
+    const double far = gap * per_cauchy;
     e.across[i] = across;
     e.agree[i] = agree;
     e.gap[i] = gap;
     e.weight[i] = near ? e.certain[i] / (1.0 + far * far) : 0.0;
   }
-  return list_active(e);
+  return share_weights(s, e);
 }
 
 // Adds a point's share to the normal equations of the parabola: four numbers side by side.
@@ -254,7 +278,7 @@ WITHIN void add_outer(const double* change, double weight, double gap, double (*
 
 // Adds those of all points to the normal equations of the bend. Neighbours mostly lie between the same two nodes,
 // whose sums meanwhile are at hand.
-WITHIN void add_bent(const Beside& e, int count, double crowd, double* pull, double (*told)[kNodes]) {
+WITHIN void add_bent(const Beside& e, int count, double* pull, double (*told)[kNodes]) {
   for (int k = 0; k < count;) {
     const int node = e.node[e.active[k]];
     double near_pull = pull[node], far_pull = pull[node + 1];
@@ -262,7 +286,7 @@ WITHIN void add_bent(const Beside& e, int count, double crowd, double* pull, dou
     double far_near = told[node + 1][node], far_far = told[node + 1][node + 1];
     for (; k < count && e.node[e.active[k]] == node; ++k) {
       const int i = e.active[k];
-      const double across = e.across[i], weight = e.weight[i] / crowd * across;
+      const double across = e.across[i], weight = e.weight[i] * across;
       const double gap = e.gap[i] + e.bent[i] * across, near = e.share[0][i], far = e.share[1][i];
       const double near_weight = near * weight, far_weight = far * weight;
       near_pull += near_weight * gap;
@@ -304,14 +328,10 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
       std::memcpy(found, start, sizeof start);
       continue;
     }
-    const double crowd = std::max(1.0, count / s.independent);
     double told[4][4] = {}, gaps[4] = {};
     for (int k = 0; k < count; ++k) {
       const int i = e.active[k];
-      const double weight = e.weight[i] / crowd;
-      const double change[4] = {e.at[0][i] * -e.across[i], e.at[1][i] * -e.across[i], e.at[2][i] * -e.across[i],
-                                0.5 * e.agree[i]};
-      add_outer(change, weight, e.gap[i], told, gaps);
+      add_outer(e.change[i], e.weight[i], e.gap[i], told, gaps);
     }
     double off[4], pull[4], moved[4];
     for (int k = 0; k < 4; ++k) off[k] = start[k] - found[k];
@@ -365,10 +385,9 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
   }
   for (int step = 0; step < s.bent_steps; ++step) {
     const int count = weigh_bent(s, found[3], extra, e.gate, e);
-    const double crowd = std::max(1.0, count / s.independent);
     double pull[kNodes] = {};
     std::memset(covariance, 0, sizeof covariance);
-    add_bent(e, count, crowd, pull, covariance);
+    add_bent(e, count, pull, covariance);
     for (int i = 0; i < kNodes; ++i) {
       pull[i] += wanted[i];
       for (int j = 0; j < kNodes; ++j) covariance[i][j] = bent_information[i][j] + covariance[i][j];
@@ -416,24 +435,23 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
 }
 
 // distances_cm() of two lines given at n places.
-double distance_of(const double* left, const double* right, const double* y, int n, int begin, int end,
-                   std::vector<double>& nearest) {
-  const double inf = std::numeric_limits<double>::infinity();
-  nearest.clear();
+WIDE double distance_of(const double* left, const double* right, const double* y, int n, int begin, int end,
+                        double* __restrict nearest) {
+  const int between = end - begin, count = 2 * between;
   for (int side = 0; side < 2; ++side) {
-    const double *own = side ? right : left, *other = side ? left : right;
-    for (int i = begin; i < end; ++i) {
-      double least = inf;
-      for (int j = 0; j < n; ++j) {
-        const double across = other[j] - own[i], ahead = y[j] - y[i];
-        least = std::min(least, across * across + ahead * ahead);
+    const double *own = (side ? right : left) + begin, *other = side ? left : right, *place = y + begin;
+    double* least = nearest + side * between;
+    std::fill_n(least, between, std::numeric_limits<double>::infinity());
+    for (int j = 0; j < n; ++j)
+      for (int i = 0; i < between; ++i) {
+        const double across = other[j] - own[i], ahead = y[j] - place[i];
+        const double square = across * across + ahead * ahead;
+        least[i] = square < least[i] ? square : least[i];
       }
-      nearest.push_back(least);
-    }
   }
-  const auto middle = nearest.begin() + nearest.size() / 2;
-  std::nth_element(nearest.begin(), middle, nearest.end());
-  const double upper = *middle, lower = *std::max_element(nearest.begin(), middle);
+  double* middle = nearest + count / 2;
+  std::nth_element(nearest, middle, nearest + count);
+  const double upper = *middle, lower = *std::max_element(nearest, middle);
   return std::sqrt((lower + upper) / 2.0);
 }
 
@@ -447,6 +465,16 @@ struct Layer {
   const float *values, *weights, *bias;  // of each plane and byte; planes x size x size x filters; of each filter
   int planes, rows, columns, size, stride, pad, filters, out_rows, out_columns;
 };
+
+inline int lowest_bit(std::uint64_t bits) {
+#ifdef __GNUC__
+  return __builtin_ctzll(bits);
+#else
+  int place = 0;
+  for (; !(bits & 1); bits >>= 1) ++place;
+  return place;
+#endif
+}
 
 // Marks the cells that hold something: not the byte that stands for 0 in their plane.
 WIDE void find_cells(const std::uint8_t* __restrict raster, const std::uint8_t* nothing, int planes, int cells,
@@ -474,7 +502,7 @@ FUSED void sum_window(const Layer& l, std::uint64_t window, int corner, const in
                       const float* bias, float* __restrict out) {
   int cells[64], places[64], count = 0;
   for (; window; window &= window - 1, ++count) {
-    const int place = __builtin_ctzll(window);
+    const int place = lowest_bit(window);
     cells[count] = offsets[place], places[count] = place * l.filters;
   }
   float total[kLanes] = {};
@@ -484,7 +512,7 @@ FUSED void sum_window(const Layer& l, std::uint64_t window, int corner, const in
     float sum[kLanes] = {};
     for (int k = 0; k < count; ++k) {
       const float value = values[plane[cells[k]]], *w = own + places[k];
-      for (int i = 0; i < kLanes; ++i) sum[i] = __builtin_fmaf(value, w[i], sum[i]);
+      for (int i = 0; i < kLanes; ++i) sum[i] = std::fma(value, w[i], sum[i]);
     }
     for (int i = 0; i < kLanes; ++i) total[i] += sum[i];
   }
@@ -599,7 +627,7 @@ PyObject* distances(PyObject*, PyObject* args) {
   if (begin < 0 || end <= begin || end > n) return refuse("compared: nothing lies between");
   try {
     const size_t l = lefts.size() / 3, r = rights.size() / 3;
-    std::vector<double> x((l + r) * n), nearest;
+    std::vector<double> x((l + r) * n), nearest(2 * (end - begin));
     for (size_t i = 0; i < l + r; ++i) {
       const double* points = i < l ? lefts.data() + 3 * i : rights.data() + 3 * (i - l);
       double curve[3];
@@ -618,7 +646,7 @@ PyObject* distances(PyObject*, PyObject* args) {
     for (size_t i = 0; i < l; ++i)
       for (size_t j = 0; j < r; ++j) {
         const double gap = rights.data()[3 * j + 1] - lefts.data()[3 * i + 1];
-        *out++ = distance_of(&x[i * n], &x[(l + j) * n], compared.data(), n, begin, end, nearest) * sign_of(gap);
+        *out++ = distance_of(&x[i * n], &x[(l + j) * n], compared.data(), n, begin, end, nearest.data()) * sign_of(gap);
       }
     return result;
   } catch (const std::exception&) {

@@ -12,7 +12,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -53,6 +53,7 @@ _FLOAT, _NUMPY_TYPES = 1, {1: np.dtype("<f4"), 2: np.dtype("u1")}
 _VARINT, _BYTES, _FIXED = 0, 2, {1: 8, 5: 4}
 
 
+@runtime_checkable
 class Runs(Protocol):
     """What a detector needs of a session of onnxruntime."""
 

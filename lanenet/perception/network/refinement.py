@@ -255,7 +255,7 @@ def _refine(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> RefinedLi
         near = there & (np.abs(agree) > _COSINE) & (np.abs(gap_cm) < most_cm)
         count = near.sum(axis=1)
         enough = count >= _LEAST
-        share = gap_cm / cauchy_cm
+        share = gap_cm * (1.0 / cauchy_cm)
         weight = near * certain / (1.0 + share * share)
         weight /= np.maximum(1.0, count / _INDEPENDENT)[:, None]
         # Change of the gap with the line's points and with the width.
@@ -294,7 +294,7 @@ def _refine(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> RefinedLi
         gap_cm, agree, across, bent_cm = beside(extra_cm)
         cosine = np.where(gate_cm > _LOOSE_CM, _ROUGHLY, _COSINE)
         near = there & (np.abs(agree) > cosine) & (np.abs(gap_cm) < gate_cm)
-        far = gap_cm / _CAUCHY_CM
+        far = gap_cm * (1.0 / _CAUCHY_CM)
         weight = near * certain / (1.0 + far * far)
         weight /= np.maximum(1.0, near.sum(axis=1) / _INDEPENDENT)[:, None]
         weighted = share * (weight * across)[:, :, None]
