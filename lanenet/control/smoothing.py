@@ -79,18 +79,19 @@ class LaneSmoother:
         confidence = estimate.confidence if math.isfinite(estimate.confidence) else 0.0
         weight = 1.0 / max(confidence, _MIN_CONFIDENCE)
         points, variances, sigmas_cm = self._points_cm, self._variance, estimate.sigma_cm.tolist()
-        for i, x_cm in enumerate(estimate.points_cm.tolist()):
-            if math.isfinite(x_cm):
-                sigma_cm = sigmas_cm[i] if math.isfinite(sigmas_cm[i]) else self._settings.default_sigma_cm
-                measured = weight * max(sigma_cm, _MIN_SIGMA_CM) ** 2
-                if math.isfinite(points[i]):
+        default_cm, isfinite = self._settings.default_sigma_cm, math.isfinite
+        for i, (x_cm, sigma_cm) in enumerate(zip(estimate.points_cm.tolist(), sigmas_cm, strict=True)):
+            known = isfinite(points[i])
+            if isfinite(x_cm):
+                measured = weight * max(sigma_cm if isfinite(sigma_cm) else default_cm, _MIN_SIGMA_CM) ** 2
+                if known:
                     gain = variances[i] / (variances[i] + measured)
                     points[i] += gain * (x_cm - points[i])
                     variances[i] *= 1.0 - gain
                 else:
-                    points[i], variances[i] = x_cm, measured
+                    known, points[i], variances[i] = True, x_cm, measured
                 self._unseen_s[i] = 0.0
-            sigmas_cm[i] = math.sqrt(variances[i]) if math.isfinite(points[i]) else math.nan
+            sigmas_cm[i] = math.sqrt(variances[i]) if known else math.nan
         # Not by dataclasses.replace(), which takes thrice the time.
         return LaneEstimate(
             points_cm=np.array(points),
@@ -105,10 +106,11 @@ class LaneSmoother:
 
     def _predict(self, dt_s: float, travel_cm: float, steering_rad: float) -> None:
         growth = dt_s * self._settings.drift_cm_per_sqrt_s**2
-        for i in range(N_POINTS):
-            self._unseen_s[i] += dt_s
-            self._variance[i] += growth
-            if self._unseen_s[i] > self._settings.hold_s + _ROUNDING_S:
+        longest_s = self._settings.hold_s + _ROUNDING_S
+        self._unseen_s = [unseen_s + dt_s for unseen_s in self._unseen_s]
+        self._variance = [variance + growth for variance in self._variance]
+        for i, unseen_s in enumerate(self._unseen_s):
+            if unseen_s > longest_s:
                 self._points_cm[i], self._variance[i] = math.nan, math.inf
         if travel_cm != 0.0:
             turn_rad = travel_cm * math.tan(steering_rad) / self._wheelbase_cm

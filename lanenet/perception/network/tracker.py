@@ -507,12 +507,14 @@ class LaneTracker:
             for right, width_cm in zip(candidates[1], row, strict=True):
                 if width_cm < least_cm:
                     continue
+                score_cm = left.score_cm + right.score_cm
                 outside_cm = max(left.points_cm[0], -right.points_cm[0])
-                apart_cm = _BY_OUTSIDE_CM * min(max(outside_cm / _OUTSIDE_CM, 0.0), 1.0)
+                if outside_cm > 0.0:
+                    score_cm -= _BY_OUTSIDE_CM * min(outside_cm / _OUTSIDE_CM, 1.0)
                 pairs.append((left, right))
-                scores.append(left.score_cm + right.score_cm - apart_cm)
+                scores.append(score_cm)
                 outsides.append(outside_cm)
-                widths.append(max(width_cm, least_cm))
+                widths.append(width_cm)
         self._rival = None
         if not pairs:
             return (candidates[0][-1], candidates[1][-1]), True
