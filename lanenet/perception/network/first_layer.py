@@ -110,25 +110,37 @@ class FirstLayer:
     def new_features(self) -> Float32[np.ndarray, "1 f r c"]:
         """Return memory for the layer's output."""
         rows, columns = ((n + 2 * self.pad - self.size) // self.stride + 1 for n in self.shape[1:])
-        return np.empty((1, len(self.bias), rows, columns), np.float32)
+        return np.zeros((1, len(self.bias), rows, columns), np.float32)
 
 
 class Halves:
     """A model in two parts; its answers are those of the whole."""
 
-    def __init__(self, layer: FirstLayer, name: str, rest: onnxruntime.InferenceSession) -> None:
+    def __init__(self, layer: FirstLayer, features: str, rest: onnxruntime.InferenceSession) -> None:
         """Take the first layer, the name of its output, and the rest, of which that is an input."""
+        from onnxruntime import OrtValue
+
         self._layer, self._rest = layer, rest
-        self._features = layer.new_features()
-        self._feed: dict[str, np.ndarray] = {name: self._features}
+        # Memory that onnxruntime reads and writes itself: it makes no arrays of its own in each frame.
+        self._features, self._width_cm = layer.new_features(), np.zeros(1, np.float32)
+        memory = {features: self._features, WIDTH_NAME: self._width_cm}
+        given = {one.name: memory[one.name] for one in rest.get_inputs()}
+        self._found = dict(zip(ANSWERS, rest.run(ANSWERS, given), strict=True))
+        self._binding = rest.io_binding()
+        for name, values in given.items():
+            self._binding.bind_ortvalue_input(name, OrtValue.ortvalue_from_numpy(values))
+        for name, values in self._found.items():
+            self._binding.bind_ortvalue_output(name, OrtValue.ortvalue_from_numpy(values))
 
     def run(self, names: Sequence[str], feed: dict[str, np.ndarray]) -> Sequence[Any]:
-        """Return some of ``ANSWERS`` for one raster, and the lane's width where the model takes it."""
+        """Return some of ``ANSWERS`` for one raster, and the lane's width where the model takes it.
+
+        The next run overwrites them.
+        """
         compiled.first_layer(self._layer, feed[INPUT_NAME][0], self._features[0])
-        if WIDTH_NAME in feed:
-            self._feed[WIDTH_NAME] = feed[WIDTH_NAME]
-        found: Sequence[Any] = self._rest.run(names, self._feed)
-        return found
+        self._width_cm[0] = feed[WIDTH_NAME][0] if WIDTH_NAME in feed else 0.0
+        self._rest.run_with_iobinding(self._binding)
+        return [self._found[name] for name in names]
 
 
 def _agree(halves: Halves, whole: Runs, meta: ModelMeta) -> bool:
@@ -138,7 +150,10 @@ def _agree(halves: Halves, whole: Runs, meta: ModelMeta) -> bool:
     looks = rng.integers(MIDDLE - STEPS, MIDDLE + STEPS + 1, (1, meta.planes, *filled.shape))
     raster = np.where(filled, looks, MIDDLE).astype(np.uint8)
     raster[0, 0] = np.where(filled, 255, 0)
-    both = zip(*(runs.run(ANSWERS, {INPUT_NAME: raster}) for runs in (halves, whole)), strict=True)
+    feed = {INPUT_NAME: raster}
+    if meta.takes_width:
+        feed[WIDTH_NAME] = np.array([meta.lane_width_cm], np.float32)
+    both = zip(*(runs.run(ANSWERS, feed) for runs in (halves, whole)), strict=True)
     return all(bool((np.abs(ours - theirs) <= SELF_TEST_TOLERANCE).all()) for ours, theirs in both)
 
 
@@ -148,7 +163,8 @@ class Cut(NamedTuple):
     Attributes:
         layer: Its first layer.
         features: Name of the layer's output.
-        rest: An ONNX file that has it as an input, in the place of the raster; its outputs are ``ANSWERS``.
+        rest: An ONNX file that has it as an input, in the place of the raster, and the lane's width as one that
+            is not optional; its outputs are ``ANSWERS``.
     """
 
     layer: FirstLayer
@@ -195,7 +211,7 @@ def cut_off(model: bytes, shape: tuple[int, int, int]) -> Cut | None:
         for number, value in graph
         if not (
             (number == _NODE and value in (decode.raw, convolve.raw))
-            or (number == _INITIALIZER and _text(value, _TENSOR_NAME) in wanted)
+            or (number == _INITIALIZER and _text(value, _TENSOR_NAME) in (*wanted, WIDTH_NAME))
             or (number == _INPUT and _text(value, 1) == INPUT_NAME)
             or (number == _OUTPUT and _text(value, 1) not in ANSWERS)
         )
