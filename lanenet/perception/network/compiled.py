@@ -50,7 +50,7 @@ def refine(
 
 
 def is_fused() -> bool:
-    """Tell whether the compiled loops multiply and add in one step here, so that :func:`first_layer` is fast."""
+    """Tell whether :func:`first_layer` is there, and fast: it multiplies and adds in one step."""
     return is_here() and bool(_kernels.has_fused())
 
 

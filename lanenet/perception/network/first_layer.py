@@ -9,14 +9,14 @@ equal wherever that multiplies and adds in one step. Any other model is run as i
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from lanenet.errors import ModelMismatchError
 from lanenet.perception.edges.raster import MIDDLE, STEPS
 from lanenet.perception.network import compiled
 from lanenet.perception.network.model_file import (
@@ -27,6 +27,22 @@ from lanenet.perception.network.model_file import (
     check_model,
     new_session,
     read_model,
+)
+from lanenet.perception.network.onnx_parts import (
+    GRAPH,
+    INITIALIZER,
+    INPUT,
+    NODE,
+    OUTPUT,
+    TENSOR_NAME,
+    VALUE_NAME,
+    Node,
+    field_of,
+    fields_of,
+    float_input,
+    only_user,
+    tensor_of,
+    text_of,
 )
 
 if TYPE_CHECKING:
@@ -42,15 +58,6 @@ ANSWERS = ("points_cm", "sigma_cm", "presence")
 _LANES, _MOST = 16, 8
 #: Share of filled cells in the raster by which a model's two halves are compared with the whole. Chosen.
 _FILLED = 0.05
-
-# Numbers of the fields in ONNX files, see onnx.proto.
-_GRAPH, _NODE, _INITIALIZER, _INPUT, _OUTPUT = 7, 1, 5, 11, 12
-_NODE_INPUT, _NODE_OUTPUT, _OP_TYPE, _ATTRIBUTE = 1, 2, 4, 5
-_ATTRIBUTE_NAME, _ATTRIBUTE_INT, _ATTRIBUTE_TEXT, _ATTRIBUTE_INTS = 1, 3, 4, 8
-_DIMS, _DATA_TYPE, _TENSOR_NAME, _RAW_DATA = 1, 2, 8, 9
-_FLOAT, _NUMPY_TYPES = 1, {1: np.dtype("<f4"), 2: np.dtype("u1")}
-# Kinds of values: whole numbers, bytes after their length, and so many bytes.
-_VARINT, _BYTES, _FIXED = 0, 2, {1: 8, 5: 4}
 
 
 @runtime_checkable
@@ -70,14 +77,26 @@ def open_network(path: Path, threads: int = 1) -> tuple[Runs, ModelMeta]:
     """
     data, where = read_model(path)
     session, meta = check_model(data, where, threads, frames=1)
-    cut = cut_off(data, (meta.planes, meta.window.rows, meta.window.columns)) if compiled.is_fused() else None
-    if cut is None:
+    halves = _halves(data, where, threads, meta)
+    if halves is None:
         return session, meta
-    halves = Halves(cut.layer, cut.features, new_session(cut.rest, where, threads, frames=1))
     if not _agree(halves, session, meta):
-        log.warning("%s: its first layer alone gives another answer: the whole model is run, slower", where)
+        log.warning("%s: without its first layer it answers otherwise: it is run as a whole, slower", where)
         return session, meta
     return halves, meta
+
+
+def _halves(data: bytes, where: str, threads: int, meta: ModelMeta) -> Halves | None:
+    """Return a model in two parts; None if it cannot be cut, or that would not make it faster."""
+    if not compiled.is_fused():
+        return None
+    cut = cut_off(data, (meta.planes, meta.window.rows, meta.window.columns))
+    if cut is None:
+        return None
+    try:
+        return Halves(cut.layer, cut.features, new_session(cut.rest, where, threads, frames=1))
+    except ModelMismatchError:
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +182,8 @@ class Cut(NamedTuple):
     Attributes:
         layer: Its first layer.
         features: Name of the layer's output.
-        rest: An ONNX file that has it as an input, in the place of the raster, and the lane's width as one that
-            is not optional; its outputs are ``ANSWERS``.
+        rest: An ONNX file that has it as an input, in the place of the raster, and the lane's width as one
+            that it always needs; its outputs are ``ANSWERS``.
     """
 
     layer: FirstLayer
@@ -183,23 +202,22 @@ def cut_off(model: bytes, shape: tuple[int, int, int]) -> Cut | None:
         Both parts; None if the model does not begin with a ``DequantizeLinear`` of the raster and a square
         convolution with a bias, or the compiled loops do not have such a layer.
     """
-    graphs = [value for number, value in _fields(model) if number == _GRAPH]
+    graphs = [value for number, value in fields_of(model) if number == GRAPH]
     if len(graphs) != 1:
         return None
-    # A graph has no field that is a whole number.
-    graph = [(number, bytes(value)) for number, value in _fields(graphs[0])]
-    nodes = [_Node.read(value) for number, value in graph if number == _NODE]
-    decode = _only_user(nodes, INPUT_NAME, "DequantizeLinear", 3)
-    convolve = None if decode is None else _only_user(nodes, decode.outputs[0], "Conv", 3)
+    graph = [*fields_of(graphs[0])]
+    nodes = [Node.read(value) for number, value in graph if number == NODE]
+    decode = only_user(nodes, INPUT_NAME, "DequantizeLinear", 3)
+    convolve = None if decode is None else only_user(nodes, decode.outputs[0], "Conv", 3)
     if decode is None or convolve is None:
         return None
     tensors = {
         name: value
         for number, value in graph
-        if number == _INITIALIZER and (name := _text(value, _TENSOR_NAME))
+        if number == INITIALIZER and (name := text_of(value, TENSOR_NAME))
     }
     wanted = (*decode.inputs[1:], *convolve.inputs[1:])
-    scale, zero, weights, bias = (_tensor(tensors[name]) if name in tensors else None for name in wanted)
+    scale, zero, weights, bias = (tensor_of(tensors[name]) if name in tensors else None for name in wanted)
     if scale is None or zero is None or weights is None or bias is None:
         return None
     layer = _layer((scale, zero, weights, bias), decode.attributes, convolve.attributes, shape)
@@ -207,18 +225,18 @@ def cut_off(model: bytes, shape: tuple[int, int, int]) -> Cut | None:
         return None
     features = convolve.outputs[0]
     rest = b"".join(
-        _field(number, value)
+        field_of(number, value)
         for number, value in graph
         if not (
-            (number == _NODE and value in (decode.raw, convolve.raw))
-            or (number == _INITIALIZER and _text(value, _TENSOR_NAME) in (*wanted, WIDTH_NAME))
-            or (number == _INPUT and _text(value, 1) == INPUT_NAME)
-            or (number == _OUTPUT and _text(value, 1) not in ANSWERS)
+            (number == NODE and value in (decode.raw, convolve.raw))
+            or (number == INITIALIZER and text_of(value, TENSOR_NAME) in (*wanted, WIDTH_NAME))
+            or (number == INPUT and text_of(value, VALUE_NAME) == INPUT_NAME)
+            or (number == OUTPUT and text_of(value, VALUE_NAME) not in ANSWERS)
         )
     )
-    rest += _field(_INPUT, _value_info(features, layer.new_features().shape))
-    others = b"".join(_field(n, v) for n, v in _fields(model) if n != _GRAPH)
-    return Cut(layer, features, others + _field(_GRAPH, rest))
+    rest += field_of(INPUT, float_input(features, layer.new_features().shape))
+    others = b"".join(field_of(n, v) for n, v in fields_of(model) if n != GRAPH)
+    return Cut(layer, features, others + field_of(GRAPH, rest))
 
 
 def _layer(
@@ -259,124 +277,3 @@ def _layer(
         stride,
         pad,
     )
-
-
-class _Node(NamedTuple):
-    """A node of a graph; its attributes are lists of whole numbers, or of a text."""
-
-    raw: bytes
-    inputs: list[str]
-    outputs: list[str]
-    kind: str
-    attributes: dict[str, list[Any]]
-
-    @staticmethod
-    def read(raw: bytes) -> _Node:
-        names: dict[int, list[str]] = {_NODE_INPUT: [], _NODE_OUTPUT: [], _OP_TYPE: []}
-        attributes: dict[str, list[Any]] = {}
-        for number, value in _fields(raw):
-            if number in names:
-                names[number].append(bytes(value).decode())
-            elif number == _ATTRIBUTE:
-                text = _text(value, _ATTRIBUTE_TEXT)
-                integers = *_integers(value, _ATTRIBUTE_INT), *_integers(value, _ATTRIBUTE_INTS)
-                attributes[_text(value, _ATTRIBUTE_NAME)] = [text] if text else [*integers]
-        return _Node(raw, names[_NODE_INPUT], names[_NODE_OUTPUT], "".join(names[_OP_TYPE]), attributes)
-
-
-def _only_user(nodes: Sequence[_Node], name: str, kind: str, n_inputs: int) -> _Node | None:
-    """Return the node of a kind that alone uses a value, as its first input."""
-    users = [node for node in nodes if name in node.inputs]
-    if len(users) != 1 or users[0].kind != kind or users[0].inputs[0] != name:
-        return None
-    return users[0] if len(users[0].inputs) == n_inputs else None
-
-
-def _tensor(raw: bytes) -> np.ndarray | None:
-    """Return a tensor of floats or bytes that is stored as raw data; None for another."""
-    kinds, data = _integers(raw, _DATA_TYPE), [bytes(v) for n, v in _fields(raw) if n == _RAW_DATA]
-    shape = _integers(raw, _DIMS)
-    if len(kinds) != 1 or kinds[0] not in _NUMPY_TYPES or len(data) != 1:
-        return None
-    number = _NUMPY_TYPES[kinds[0]]
-    if len(data[0]) != math.prod(shape) * number.itemsize:
-        return None
-    return np.frombuffer(data[0], number).reshape(shape)
-
-
-def _value_info(name: str, shape: Sequence[int]) -> bytes:
-    """Return the description of an input of floats."""
-    dims = b"".join(_field(1, _field(1, n)) for n in shape)
-    return _field(1, name.encode()) + _field(2, _field(1, _field(1, _FLOAT) + _field(2, dims)))
-
-
-# Messages of Protocol Buffers: fields with a number, one after the other, whose values are whole numbers or bytes.
-
-
-def _fields(message: bytes | memoryview) -> Iterator[tuple[int, Any]]:
-    """Return the number of each field, and its value: a whole number, or a view of its bytes.
-
-    Raises:
-        ValueError: If it is no such message.
-    """
-    view, at = memoryview(message), 0
-    while at < len(view):
-        key, at = _varint(view, at)
-        number, kind = key >> 3, key & 7
-        if kind == _VARINT:
-            value, at = _varint(view, at)
-            yield number, value
-            continue
-        if kind == _BYTES:
-            length, at = _varint(view, at)
-        elif kind in _FIXED:
-            length = _FIXED[kind]
-        else:
-            raise ValueError(f"field {number}: of unknown kind {kind}")
-        yield number, view[at : at + length]
-        at += length
-
-
-def _varint(view: memoryview, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = view[at]
-        value |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
-        if byte < 0x80:
-            return value, at
-
-
-def _field(number: int, value: int | bytes | memoryview) -> bytes:
-    if isinstance(value, int):
-        return _as_varint(number << 3 | _VARINT) + _as_varint(value)
-    return _as_varint(number << 3 | _BYTES) + _as_varint(len(value)) + bytes(value)
-
-
-def _as_varint(value: int) -> bytes:
-    out = bytearray()
-    while value >= 0x80:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
-
-
-def _text(message: bytes | memoryview, number: int) -> str:
-    return b"".join(bytes(value) for n, value in _fields(message) if n == number).decode()
-
-
-def _integers(message: bytes | memoryview, number: int) -> list[int]:
-    """Return the whole numbers of a field that is repeated, one by one or packed."""
-    found: list[int] = []
-    for n, value in _fields(message):
-        if n != number:
-            continue
-        if isinstance(value, int):
-            found.append(value)
-            continue
-        at = 0
-        while at < len(value):
-            integer, at = _varint(value, at)
-            found.append(integer)
-    return found

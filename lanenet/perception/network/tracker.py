@@ -264,9 +264,7 @@ class LaneTracker:
                 found_sigma_cm[other + i] = math.inf
                 continue
             found_cm[other + i] = told_cm
-            found_sigma_cm[other + i] = math.hypot(
-                found_sigma_cm[own + i], self.lane.width_sigma * width_cm
-            )
+            found_sigma_cm[other + i] = math.hypot(found_sigma_cm[own + i], self.lane.width_sigma * width_cm)
 
     def _recall_near(
         self,

@@ -87,16 +87,38 @@ def test_answers_of_a_drive_are_the_same(real):
     assert_same(found, by_numpy(answers))
 
 
+def test_a_line_does_not_depend_on_those_asked_with_it():
+    rng = np.random.default_rng(3)
+    y = rng.uniform(0.0, 40.0, 400)
+    points_cm = np.stack([rng.choice([-21.5, -18.5, 18.5, 21.5], 400) + rng.normal(0.0, 2.0, 400), y], axis=1)
+    borders = RoadBorders(RoadEdges(points_cm, np.tile([1.0, 0.0], (400, 1))))
+    known = [2.0] * 3
+    asked = np.array(
+        [[-20.0] * 3 + known + [3.0, 2.0] + [np.nan] * 2, [19.0] * 3 + known + [8.0, 0.3, 0.1, 0.2]]
+    )
+
+    def together():
+        return refinement.refined(asked, borders)
+
+    def apart():
+        return np.concatenate([refinement.refined(line[None], borders) for line in asked])
+
+    for work in (together, apart):
+        assert_same([work()], by_numpy(lambda work=work: [work()]))
+    assert_same([together()], [apart()])
+
+
 def test_memory_beyond_the_arguments_is_not_read():
     """The checks of the compiled code itself, behind those of its callers."""
     edges = np.zeros((9, 2))
-    good = [np.zeros((2, 3)), np.ones((2, 3)), np.ones(2), np.ones(2), np.zeros((2, 2)), edges, edges, edges]
-    good += [refinement._NUMBERS, False]
+    good = [np.ones((2, 10)), edges, edges, edges, refinement._NUMBERS, False]
     assert len(compiled._kernels.refine(*good)) == 2 * compiled._PER_LINE * 8
     # A bin beside the first label row.
     wrong_bin = refinement._NUMBERS.copy()
     wrong_bin[9 + 9 + 64 + 8 + 3] = 64.0
-    for at in range(len(good) - 2):
+    with pytest.raises(ValueError, match=r"differ"):
+        compiled._kernels.refine(good[0].ravel()[:-1], *good[1:])
+    for at in range(1, len(good) - 2):
         with pytest.raises(ValueError, match=r"differ"):
             compiled._kernels.refine(*good[:at], good[at][:1], *good[at + 1 :])
     for numbers in (good[-2][1:], wrong_bin):
