@@ -51,16 +51,17 @@ def fault_of(estimate: LaneEstimate) -> str:
     points, sigmas = estimate.points_cm.tolist(), estimate.sigma_cm.tolist()
     if not 0.0 <= estimate.confidence <= 1.0:
         return f"confidence {estimate.confidence:g}"
-    if any(not (0.0 <= p <= 1.0 or math.isnan(p)) for p in estimate.presence.tolist()):
+    # Lists, not generators: for so few values these cost more than what is compared.
+    if [p for p in estimate.presence.tolist() if not (0.0 <= p <= 1.0 or math.isnan(p))]:
         return f"presence {estimate.presence}"
     if abs(estimate.steering_rad) > 0.5 * math.pi:
         return f"steering {estimate.steering_rad:g} rad"
-    if any(abs(x) > _REACH_CM for x in points):
-        return f"a line {max(abs(x) for x in points if x == x):.0f} cm to the side"
+    if beyond_cm := [abs(x) for x in points if abs(x) > _REACH_CM]:
+        return f"a line {max(beyond_cm):.0f} cm to the side"
     known = [sigma for x, sigma in zip(points, sigmas, strict=True) if x == x]
-    if not all(0.0 <= s < math.inf for s in known) and not all(math.isnan(s) for s in known):
+    if [s for s in known if not 0.0 <= s < math.inf] and not all(map(math.isnan, known)):
         return f"sigma {known}"
-    if any(right <= left for left, right in zip(points[:3], points[3:], strict=True)):
+    if [left for left, right in zip(points[:3], points[3:], strict=True) if right <= left]:
         return "lines that cross"
     return ""
 

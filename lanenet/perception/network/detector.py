@@ -269,10 +269,8 @@ def confidence(
     # Written so that NaN fails as well.
     if not (0.0 <= left <= 1.0 and 0.0 <= right <= 1.0):
         return 0.0
-    if not all(
-        math.isnan(x) or (math.isfinite(x) and 0.0 <= s < math.inf)
-        for x, s in zip(points, sigmas, strict=True)
-    ):
+    both = zip(points, sigmas, strict=True)
+    if [x for x, s in both if not (math.isnan(x) or (math.isfinite(x) and 0.0 <= s < math.inf))]:
         return 0.0
     low, high = width_range_cm
     if known_width_cm is not None:

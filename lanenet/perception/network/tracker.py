@@ -206,7 +206,7 @@ class LaneTracker:
             line was seen, [cm].
         """
         network_cm = points_cm.tolist()
-        own = _both(network_cm), _both((_NETWORK_SIGMA * sigma_cm).tolist())
+        own = _both(network_cm), _both([_NETWORK_SIGMA * each_cm for each_cm in sigma_cm.tolist()])
         present = presence.tolist()
         borders = RoadBorders(edges)
         starts, measured = self._starts(own, present), self._to_measure(own, present)
@@ -291,9 +291,9 @@ class LaneTracker:
         """Return points and sigmas, NaN where the place is unknown; ``own_cm`` is the network's answer."""
         most_cm, known_cm, known_sigma_cm = _MOST_LANES * self.lane.likely_cm, [], []
         apart_cm = [abs(x - own_x) for x, own_x in zip(points_cm, own_cm, strict=True)]
-        for i, (x, sigma) in enumerate(zip(points_cm, sigma_cm, strict=True)):
-            middle = i - i % len(ROWS_CM) + _MIDDLE
-            known = math.hypot(sigma, max(apart_cm[i], apart_cm[middle])) <= most_cm
+        middles_cm = [middle for middle in apart_cm[_MIDDLE :: len(ROWS_CM)] for _ in ROWS_CM]
+        for x, sigma, apart, middle in zip(points_cm, sigma_cm, apart_cm, middles_cm, strict=True):
+            known = math.hypot(sigma, middle if middle > apart else apart) <= most_cm
             known_cm.append(x if known else math.nan)
             known_sigma_cm.append(sigma if known else math.nan)
         return np.array(known_cm), np.array(known_sigma_cm)
@@ -350,10 +350,11 @@ class LaneTracker:
 
     def _arrive(self, pair: tuple[_Candidate, _Candidate], presence: list[float]) -> None:
         """End a change of lane, once the new one has shown both of its lines, or the crossed one is far."""
-        shown = all(
-            line.seen_cm >= _WIDTH_SEEN_CM and p > SEEN for line, p in zip(pair, presence, strict=True)
-        )
-        self._entered = self._entered and not shown and self._nearest_line()[1] < _NEAR_LINE
+        if self._entered:
+            shown = all(
+                line.seen_cm >= _WIDTH_SEEN_CM and p > SEEN for line, p in zip(pair, presence, strict=True)
+            )
+            self._entered = not shown and self._nearest_line()[1] < _NEAR_LINE
 
     def _side_is_a_guess(self, presence: list[float]) -> bool:
         """Return whether nothing tells on which side of a line the front axle's middle is."""
@@ -497,8 +498,9 @@ class LaneTracker:
         Returns:
             The pair, and whether clearly less speaks for each pair in the next lane.
         """
-        lefts_cm, rights_cm = ([line.points_cm for line in lines] for lines in candidates)
-        across_cm = distances_cm(np.array(lefts_cm), np.array(rights_cm)).tolist()
+        lines_cm = np.array([line.points_cm for lines in candidates for line in lines])
+        lefts = len(candidates[0])
+        across_cm = distances_cm(lines_cm[:lefts], lines_cm[lefts:]).tolist()
         least_cm = _NARROWEST * self.lane.likely_cm
         pairs, scores, outsides, widths = [], [], [], []
         for left, row in zip(candidates[0], across_cm, strict=True):
@@ -528,17 +530,25 @@ class LaneTracker:
             both = [min(left.presence, right.presence) for left, right in pairs]
             scores = [s + _BY_BOTH_CM * p * own for s, p, own in zip(scores, both, likely, strict=True)]
         chosen = scores.index(max(scores))
-        middles_cm = [0.5 * (left.points_cm[_MIDDLE] + right.points_cm[_MIDDLE]) for left, right in pairs]
-        next_cm = _NEXT_LANE * self.lane.likely_cm
-        beside = [i for i, x in enumerate(middles_cm) if abs(x - middles_cm[chosen]) > next_cm]
-        rival = max(beside, key=scores.__getitem__, default=chosen)
-        decided = rival == chosen or scores[rival] < scores[chosen] - _UNDECIDED_CM
-        self._rival = None if decided else pairs[rival]
-        return pairs[chosen], decided
+        least, next_cm = scores[chosen] - _UNDECIDED_CM, _NEXT_LANE * self.lane.likely_cm
+        middle_cm = _middle_cm(pairs[chosen])
+        rivals = [
+            i
+            for i, score in enumerate(scores)
+            if score >= least and abs(_middle_cm(pairs[i]) - middle_cm) > next_cm
+        ]
+        self._rival = pairs[max(rivals, key=scores.__getitem__)] if rivals else None
+        return pairs[chosen], not rivals
 
 
 def _both(values: list[float]) -> _Both:
     return [values[: len(ROWS_CM)], values[len(ROWS_CM) :]]
+
+
+def _middle_cm(pair: tuple[_Candidate, _Candidate]) -> float:
+    """Return x of the middle between two lines, 15 cm ahead."""
+    left, right = pair
+    return 0.5 * (left.points_cm[_MIDDLE] + right.points_cm[_MIDDLE])
 
 
 def _moved(sigma_cm: list[float]) -> list[float]:
