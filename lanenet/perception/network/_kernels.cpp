@@ -54,7 +54,7 @@ struct Numbers {
 struct Near {
   std::vector<double> x, y, normal_x, normal_y, yellow, red;
   std::vector<double> key, chosen;
-  std::vector<std::uint8_t> beside;
+  std::vector<std::int64_t> beside;  // as wide as what is compared, so that four are at a time
   std::vector<int> index;
   int count;
 };
@@ -66,11 +66,28 @@ struct Beside {
   double weight[kMost], gate[kMost], share[2][kMost], lean[2][kMost], bent[kMost];
   // Node before each, bin in which it lies, and those that count at present.
   int node[kMost], bin[kMost], active[kMost], n;
+  // Neighbours between the same two nodes: the first of each run, and the one after the last.
+  int run[kMost + 1], runs;
 };
 
 struct Parabola {
   double a, b, c;
 };
+
+// Four numbers at a time.
+#ifdef __GNUC__
+typedef double Four __attribute__((vector_size(32)));
+#else
+struct Four {
+  double at[4];
+  double operator[](int i) const { return at[i]; }
+  Four operator*(double factor) const { return {{at[0] * factor, at[1] * factor, at[2] * factor, at[3] * factor}}; }
+  void operator+=(const Four& more) {
+    for (int i = 0; i < 4; ++i) at[i] += more.at[i];
+  }
+};
+inline Four operator*(double factor, const Four& four) { return four * factor; }
+#endif
 
 // x of lines at y, as _line_at().
 inline Parabola parabola_of(const Numbers& s, const double* points) {
@@ -115,30 +132,35 @@ void take_near(const Numbers& s, const T* points, const T* normals, const T* hue
     values->resize(n);
   out.beside.resize(n);
   out.index.resize(n);
-  // Every point is written, and the next one over it unless it counts: so there is no branch to guess.
-  size_t count = 0;
+  // Every index is written, and the next one over it unless it counts: so there is no branch to guess.
+  int count = 0;
   for (size_t i = 0; i < n; ++i) {
-    const double y = points[2 * i + 1], spread = count * s.golden;
-    out.x[count] = points[2 * i];
-    out.y[count] = y;
-    out.normal_x[count] = normals[2 * i];
-    out.normal_y[count] = normals[2 * i + 1];
-    out.yellow[count] = hues ? hues[2 * i] : 0.0;
-    out.red[count] = hues ? hues[2 * i + 1] : 0.0;
-    out.key[count] = spread - static_cast<double>(static_cast<std::int64_t>(spread));
+    const double y = points[2 * i + 1];
+    out.index[count] = static_cast<int>(i);
     count += (y > s.near_cm) & (y < s.far_cm);
   }
-  out.count = static_cast<int>(count);
+  for (int k = 0; k < count; ++k) {
+    const size_t i = out.index[k];
+    const double spread = k * s.golden;
+    out.x[k] = points[2 * i];
+    out.y[k] = points[2 * i + 1];
+    out.normal_x[k] = normals[2 * i];
+    out.normal_y[k] = normals[2 * i + 1];
+    out.yellow[k] = hues ? hues[2 * i] : 0.0;
+    out.red[k] = hues ? hues[2 * i + 1] : 0.0;
+    out.key[k] = spread - static_cast<int>(spread);
+  }
+  out.count = count;
 }
 
 // Whether each edge point is within reach of a line and runs roughly along it; squares save the roots.
 WIDE void look_beside(const double* x, const double* y, const double* normal_x, const double* normal_y, int n,
-                      double a, double b, double c, double reach_cm, double roughly, std::uint8_t* beside) {
+                      double a, double b, double c, double reach_cm, double roughly, std::int64_t* __restrict beside) {
   const double a2 = 2.0 * a, reach2 = reach_cm * reach_cm, roughly2 = roughly * roughly;
   for (int i = 0; i < n; ++i) {
     const double slope = a2 * y[i] + b, steep = 1.0 + slope * slope;
     const double off = x[i] - ((a * y[i] + b) * y[i] + c), facing = normal_x[i] - normal_y[i] * slope;
-    beside[i] = (off * off < reach2 * steep) & (facing * facing > roughly2 * steep);
+    beside[i] = (off * off < reach2 * steep) & (facing * facing > roughly2 * steep) ? 1 : 0;
   }
 }
 
@@ -168,7 +190,7 @@ void choose(const Numbers& s, const Parabola& line, double reach_cm, Near& near,
   int count = 0;
   for (int i = 0; i < n; ++i) {
     index[count] = i;
-    count += near.beside[i];
+    count += static_cast<int>(near.beside[i]);
   }
   if (count > kMost) {
     const double most = smallest_key(near, count);
@@ -246,10 +268,12 @@ WIDE int weigh_parabola(const Numbers& s, const Parabola& line, double marking, 
 // The same along a line that bends.
 WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, double* gate, Beside& e) {
   const double per_cauchy = 1.0 / s.cauchy_cm;
-  for (int i = 0; i < e.n; ++i) {
-    const double *here = extra + e.node[i];
-    e.bent[i] = e.share[0][i] * here[0] + e.share[1][i] * here[1];
-    e.weight[i] = e.lean[0][i] * here[0] + e.lean[1][i] * here[1];
+  for (int k = 0; k < e.runs; ++k) {
+    const double near = extra[e.node[e.run[k]]], far = extra[e.node[e.run[k]] + 1];
+    for (int i = e.run[k]; i < e.run[k + 1]; ++i) {
+      e.bent[i] = e.share[0][i] * near + e.share[1][i] * far;
+      e.weight[i] = e.lean[0][i] * near + e.lean[1][i] * far;
+    }
   }
   for (int i = 0; i < e.n; ++i) {
     const double steep = e.slope[i] + e.weight[i], across = 1.0 / std::sqrt(1.0 + steep * steep);
@@ -267,13 +291,19 @@ WIDE int weigh_bent(const Numbers& s, double marking, const double* extra, doubl
   return share_weights(s, e);
 }
 
-// Adds a point's share to the normal equations of the parabola: four numbers side by side.
-WITHIN void add_outer(const double* change, double weight, double gap, double (*told)[4], double* gaps) {
-  double weighted[4];
-  for (int k = 0; k < 4; ++k) weighted[k] = change[k] * weight;
-  for (int k = 0; k < 4; ++k) gaps[k] += weighted[k] * gap;
-  for (int k = 0; k < 4; ++k)
-    for (int j = 0; j < 4; ++j) told[k][j] += weighted[k] * change[j];
+// Adds the points' shares to the normal equations of the parabola.
+WITHIN void add_parabola(const Beside& e, int count, double* gaps, double (*told)[4]) {
+  Four sums[4] = {}, pulls = {};
+  for (int k = 0; k < count; ++k) {
+    const int i = e.active[k];
+    Four change;
+    std::memcpy(&change, e.change[i], sizeof change);
+    const Four weighted = change * e.weight[i];
+    pulls += weighted * e.gap[i];
+    for (int j = 0; j < 4; ++j) sums[j] += weighted[j] * change;
+  }
+  std::memcpy(gaps, &pulls, sizeof pulls);
+  std::memcpy(told, sums, sizeof sums);
 }
 
 // Adds those of all points to the normal equations of the bend. Neighbours mostly lie between the same two nodes,
@@ -329,10 +359,7 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
       continue;
     }
     double told[4][4] = {}, gaps[4] = {};
-    for (int k = 0; k < count; ++k) {
-      const int i = e.active[k];
-      add_outer(e.change[i], e.weight[i], e.gap[i], told, gaps);
-    }
+    add_parabola(e, count, gaps, told);
     double off[4], pull[4], moved[4];
     for (int k = 0; k < 4; ++k) off[k] = start[k] - found[k];
     times(information, off, pull);
@@ -367,6 +394,10 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
     e.bin[i] = static_cast<int>((y - s.near_cm) / s.bin_cm);
     e.gate[i] = s.bent_first_cm;
   }
+  e.runs = 0;
+  for (int i = 0; i < e.n; ++i)
+    if (i == 0 || e.node[i] != e.node[i - 1]) e.run[e.runs++] = i;
+  e.run[e.runs] = e.n;
   for (int k = 0; k < 2; ++k)
     for (int i = 0; i < e.n; ++i) {
       const double ahead = (s.nodes_cm[e.node[i] + k] - e.y[i]) / s.node_cm, share = 1.0 - std::abs(ahead);
@@ -396,8 +427,10 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
     times(covariance, pull, extra);
     for (int i = 0; i < kNodes; ++i)
       reach[i] = std::min(std::max(s.bent_sigmas * std::sqrt(covariance[i][i]), s.last_cm), s.bent_cm);
-    for (int i = 0; i < e.n; ++i)
-      e.gate[i] = e.share[0][i] * reach[e.node[i]] + e.share[1][i] * reach[e.node[i] + 1];
+    for (int k = 0; k < e.runs; ++k) {
+      const double near = reach[e.node[e.run[k]]], far = reach[e.node[e.run[k]] + 1];
+      for (int i = e.run[k]; i < e.run[k + 1]; ++i) e.gate[i] = e.share[0][i] * near + e.share[1][i] * far;
+    }
   }
   weigh_bent(s, found[3], extra, e.gate, e);
   bool seen[2][kMostBins] = {};
