@@ -62,7 +62,8 @@ struct Near {
 // Edge points of one line.
 struct Beside {
   double x[kMost], y[kMost], normal_x[kMost], normal_y[kMost], yellow[kMost], red[kMost], certain[kMost];
-  double at[kRows][kMost], change[kMost][kRows + 1], slope[kMost], beyond[kMost], across[kMost], agree[kMost], gap[kMost];
+  double at[kRows][kMost], change[kMost][kRows + 1];
+  double slope[kMost], beyond[kMost], across[kMost], agree[kMost], gap[kMost];
   double weight[kMost], gate[kMost], share[2][kMost], lean[2][kMost], bent[kMost];
   // Node before each, bin in which it lies, and those that count at present.
   int node[kMost], bin[kMost], active[kMost], n;
