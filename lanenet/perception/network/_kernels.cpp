@@ -510,10 +510,9 @@ inline int lowest_bit(std::uint64_t bits) {
 #endif
 }
 
-// Marks the cells that hold something: not the byte that stands for 0 in their plane.
+// Marks the cells that hold something: not the byte that stands for 0 in their plane. `filled` is 0 before.
 WIDE void find_cells(const std::uint8_t* __restrict raster, const std::uint8_t* nothing, int planes, int cells,
                      std::uint8_t* __restrict filled) {
-  std::memset(filled, 0, cells);
   for (int p = 0; p < planes; ++p, raster += cells) {
     const std::uint8_t zero = nothing[p];
     for (int i = 0; i < cells; ++i) filled[i] |= raster[i] ^ zero;
@@ -555,8 +554,11 @@ FUSED void sum_window(const Layer& l, std::uint64_t window, int corner, const in
 
 void convolve(const Layer& l, const std::uint8_t* nothing, float* out) {
   const int cells = l.rows * l.columns, outs = l.out_rows * l.out_columns;
-  std::vector<std::uint8_t> filled(cells + 8);
-  std::vector<std::uint64_t> windows(outs);
+  // Kept from frame to frame; one caller at a time: the interpreter's lock is held.
+  static std::vector<std::uint8_t> filled;
+  static std::vector<std::uint64_t> windows;
+  filled.assign(cells + 8, 0);
+  windows.assign(outs, 0);
   find_cells(l.raster, nothing, l.planes, cells, filled.data());
   for (int begin = 0; begin < cells; begin += 8) {
     std::uint64_t eight;

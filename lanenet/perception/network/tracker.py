@@ -212,13 +212,14 @@ class LaneTracker:
         starts, measured = self._starts(own, present), self._to_measure(own, present)
         # In one go, since each look at the edge points has a price.
         found = self._refine([*starts, *measured], borders)
-        pair, decided = self._best_pair(self._candidates(starts, found, own, present))
+        looked_for, measures = found[: len(starts)], found[len(starts) :]
+        pair, decided = self._best_pair(self._candidates(starts, looked_for, own, present))
         if self._at_junction(pair, present, borders):
             continued_cm, continued_sigma_cm = (x.ravel().tolist() for x in self.straight_on.lane())
             self._last = _both(continued_cm), _both(continued_sigma_cm)
             return (*self._known(continued_cm, continued_sigma_cm, continued_cm), np.zeros(len(SIDES)))
         self._notice_change(pair)
-        self._learn_markings(pair, zip(measured, found[len(starts) :], strict=True))
+        self._learn_markings(pair, zip(measured, measures, strict=True))
         for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
                 self.looks.remember(side, line.look)
@@ -253,10 +254,10 @@ class LaneTracker:
         edges: RoadEdges,
     ) -> None:
         """Take the lane's other line from the one of a side, where that alone is seen."""
-        width_cm, widths_cm = self.lane.width_cm, self._markings_cm[side]
+        width_cm = self.lane.width_cm
         if width_cm is None:
             return
-        marking_cm = widths_cm.median if len(widths_cm) >= _ENOUGH else _MARKING_CM
+        marking_cm = self._usual_marking_cm(side) or _MARKING_CM
         seen = SeenLine(side, np.array(line.points_cm), line.seen_at[-1], marking_cm)
         own, other = len(ROWS_CM) * side, len(ROWS_CM) * (1 - side)
         for i, told_cm in enumerate(line_beside(seen, width_cm, edges).tolist()):
@@ -293,7 +294,7 @@ class LaneTracker:
         apart_cm = [abs(x - own_x) for x, own_x in zip(points_cm, own_cm, strict=True)]
         middles_cm = [middle for middle in apart_cm[_MIDDLE :: len(ROWS_CM)] for _ in ROWS_CM]
         for x, sigma, apart, middle in zip(points_cm, sigma_cm, apart_cm, middles_cm, strict=True):
-            known = math.hypot(sigma, middle if middle > apart else apart) <= most_cm
+            known = math.hypot(sigma, max(apart, middle)) <= most_cm
             known_cm.append(x if known else math.nan)
             known_sigma_cm.append(sigma if known else math.nan)
         return np.array(known_cm), np.array(known_sigma_cm)
@@ -303,8 +304,7 @@ class LaneTracker:
     ) -> tuple[list[_Candidate], list[_Candidate]]:
         """Rate what the left and the right line may be; the last of each is the network's, as it is."""
         candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
-        # Behind the lines that were looked for come those that are only measured.
-        for start, line in zip(starts, found, strict=False):
+        for start, line in zip(starts, found, strict=True):
             if start.beyond and line.seen_cm < _BEYOND_SEEN_CM:
                 continue
             score_cm = start.score_cm
@@ -447,7 +447,7 @@ class LaneTracker:
 
         What was learned has no say: else a wrong belief would find itself confirmed in every frame.
         """
-        known = all(len(widths_cm) >= _ENOUGH for widths_cm in self._markings_cm)
+        known = all(self._usual_marking_cm(side) is not None for side in range(len(SIDES)))
         if known and (self._frames + 1) % _MEASURED_EVERY:
             return []
         return [
@@ -467,13 +467,18 @@ class LaneTracker:
             if found.seen_cm >= _WIDTH_SEEN_CM and off_cm < _SAME * self.lane.likely_cm:
                 self._markings_cm[start.side].append(found.marking_cm)
 
+    def _usual_marking_cm(self, side: int) -> float | None:
+        """Return the width of a line's marking, negative if dark; None until enough frames showed it."""
+        widths_cm = self._markings_cm[side]
+        return widths_cm.median if len(widths_cm) >= _ENOUGH else None
+
     def _refine(self, starts: Sequence[_Start], borders: RoadBorders) -> list[_Found]:
         """Refine lines; light and dark are tried until markings are known, and where they are measured."""
         asked, both = [], []
         for start in starts:
-            widths_cm = self._markings_cm[start.side]
-            unknown = start.measured or len(widths_cm) < _ENOUGH
-            marking_cm = _MARKING_CM if unknown else widths_cm.median
+            usual_cm = None if start.measured else self._usual_marking_cm(start.side)
+            unknown = usual_cm is None
+            marking_cm = usual_cm or _MARKING_CM
             sigma_cm = _MARKING_SIGMA_CM if unknown else _KNOWN_SIGMA_CM
             hues = self.looks.hues(start.known_as)
             for width_cm in (marking_cm, -marking_cm) if unknown else (marking_cm,):
