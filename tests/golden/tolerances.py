@@ -43,7 +43,7 @@ TOLERANCES = {
         # 1.1 / 2.9
         "map.open_loop_cm": Tolerance(3.0, 8.0),
         # 0.15 / 0.26, and 0.18 / 0.71 between two processors
-        "map.line *": Tolerance(0.5, 1.5, 0.01),
+        "map.line *": Tolerance(0.35, 1.5, 0.01),
         # 0.0001
         "map.tape of line *": Tolerance(0.005, 0.005),
         "map.lane and tape_cm": Tolerance(0.005, 0.005),
