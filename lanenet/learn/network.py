@@ -13,17 +13,13 @@ from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, ROWS_CM, SIDES
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.trunks import TRUNKS
 from lanenet.perception.edges.raster import MIDDLE, STEPS
+from lanenet.perception.network.compact.network import SIGMA_RANGE_CM, WIDTH_SIGMA
 
 #: Distance of the lane centre A that the paper steers at, [cm]; it is one of the label rows.
 LOOKAHEAD_CM = ROWS_CM[1]
 #: Centres of the eight Gaussians that encode the lane width, [cm]: from narrow model roads to wide ones, each
 #: 4/3 of the one before.
 _WIDTHS_CM = (15.0, 20.0, 27.0, 36.0, 48.0, 64.0, 85.0, 114.0)
-#: Sigma of these Gaussians in log width: about the distance of two centres, log(4/3).
-_WIDTH_SIGMA = 0.25
-#: The predicted sigma stays within these, [cm], before it is calibrated. Chosen: from below the best labels'
-#: error to half the window.
-SIGMA_RANGE_CM = (0.05, 50.0)
 _LOG_LOW, _LOG_HIGH = (math.log(v) for v in SIGMA_RANGE_CM)
 
 
@@ -139,7 +135,7 @@ class LaneNet(nn.Module):
         """Return what the lane width adds to each biased layer and to the hidden layer, w x channels."""
         assert self.width_bias is not None
         off = torch.log(lane_cm.clamp(min=1.0)[:, None]) - self.log_widths
-        code = torch.exp(-0.5 * (off / _WIDTH_SIGMA) ** 2) * (lane_cm > 0.0)[:, None]
+        code = torch.exp(-0.5 * (off / WIDTH_SIGMA) ** 2) * (lane_cm > 0.0)[:, None]
         return [layer(code) for layer in self.width_bias]
 
     @torch.no_grad()

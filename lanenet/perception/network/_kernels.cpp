@@ -21,12 +21,6 @@
 #else
 #define WIDE
 #endif
-// With fused multiplications and additions, which x86-64 has since 2013; only called where fuses() says so.
-#if defined(__x86_64__) && defined(__GNUC__)
-#define FUSED __attribute__((target("avx2,fma")))
-#else
-#define FUSED
-#endif
 // Part of its caller, for whichever processor that is compiled.
 #ifdef __GNUC__
 #define WITHIN inline __attribute__((always_inline))
@@ -489,101 +483,6 @@ WIDE double distance_of(const double* left, const double* right, const double* y
   return std::sqrt((lower + upper) / 2.0);
 }
 
-// --- The first layer of a network ---
-
-constexpr int kLanes = 16, kMostPlanes = 8, kMostCells = 4096;  // filters at a time; planes; rows or columns
-
-// A convolution of a raster of few cells that hold anything.
-struct Layer {
-  const std::uint8_t* raster;  // planes x rows x columns
-  const float *values, *weights, *bias;  // of each plane and byte; planes x size x size x filters; of each filter
-  int planes, rows, columns, size, stride, pad, filters, out_rows, out_columns;
-};
-
-inline int lowest_bit(std::uint64_t bits) {
-#ifdef __GNUC__
-  return __builtin_ctzll(bits);
-#else
-  int place = 0;
-  for (; !(bits & 1); bits >>= 1) ++place;
-  return place;
-#endif
-}
-
-// Marks the cells that hold something: not the byte that stands for 0 in their plane. `filled` is 0 before.
-WIDE void find_cells(const std::uint8_t* __restrict raster, const std::uint8_t* nothing, int planes, int cells,
-                     std::uint8_t* __restrict filled) {
-  for (int p = 0; p < planes; ++p, raster += cells) {
-    const std::uint8_t zero = nothing[p];
-    for (int i = 0; i < cells; ++i) filled[i] |= raster[i] ^ zero;
-  }
-}
-
-// Puts a cell into all windows that it lies in: of each, bit `size * row + column` says whether that cell is filled.
-inline void put_cell(const Layer& l, int row, int column, std::uint64_t* windows) {
-  const int bottom = (row + l.pad) / l.stride, right = (column + l.pad) / l.stride;
-  for (int y = bottom, down = row + l.pad - bottom * l.stride; y >= 0 && down < l.size; --y, down += l.stride) {
-    if (y >= l.out_rows) continue;
-    for (int x = right, aside = column + l.pad - right * l.stride; x >= 0 && aside < l.size; --x, aside += l.stride)
-      if (x < l.out_columns) windows[y * l.out_columns + x] |= std::uint64_t{1} << (l.size * down + aside);
-  }
-}
-
-// Adds up the cells of one window for 16 filters: a sum for each plane, by one fused multiplication and addition after
-// the other from the upper left to the lower right, then those of the planes and the bias, as onnxruntime does.
-FUSED void sum_window(const Layer& l, std::uint64_t window, int corner, const int* offsets, const float* weights,
-                      const float* bias, float* __restrict out) {
-  int cells[64], places[64], count = 0;
-  for (; window; window &= window - 1, ++count) {
-    const int place = lowest_bit(window);
-    cells[count] = offsets[place], places[count] = place * l.filters;
-  }
-  float total[kLanes] = {};
-  for (int p = 0; p < l.planes; ++p) {
-    const std::uint8_t* plane = l.raster + p * l.rows * l.columns + corner;
-    const float *values = l.values + 256 * p, *own = weights + p * l.size * l.size * l.filters;
-    float sum[kLanes] = {};
-    for (int k = 0; k < count; ++k) {
-      const float value = values[plane[cells[k]]], *w = own + places[k];
-      for (int i = 0; i < kLanes; ++i) sum[i] = std::fma(value, w[i], sum[i]);
-    }
-    for (int i = 0; i < kLanes; ++i) total[i] += sum[i];
-  }
-  for (int i = 0; i < kLanes; ++i) out[i] = total[i] + bias[i];
-}
-
-void convolve(const Layer& l, const std::uint8_t* nothing, float* out) {
-  const int cells = l.rows * l.columns, outs = l.out_rows * l.out_columns;
-  // Kept from frame to frame; one caller at a time: the interpreter's lock is held.
-  static std::vector<std::uint8_t> filled;
-  static std::vector<std::uint64_t> windows;
-  filled.assign(cells + 8, 0);
-  windows.assign(outs, 0);
-  find_cells(l.raster, nothing, l.planes, cells, filled.data());
-  for (int begin = 0; begin < cells; begin += 8) {
-    std::uint64_t eight;
-    std::memcpy(&eight, filled.data() + begin, 8);
-    if (!eight) continue;
-    for (int i = begin; i < begin + 8; ++i)
-      if (filled[i]) put_cell(l, i / l.columns, i % l.columns, windows.data());
-  }
-  int offsets[64];
-  for (int i = 0; i < l.size * l.size; ++i) offsets[i] = i / l.size * l.columns + i % l.size;
-  for (int f = 0; f < l.filters; f += kLanes) {
-    float* own = out + f * outs;
-    for (int i = 0; i < kLanes; ++i) std::fill_n(own + i * outs, outs, l.bias[f + i]);
-    const std::uint64_t* window = windows.data();
-    for (int y = 0; y < l.out_rows; ++y)
-      for (int x = 0; x < l.out_columns; ++x, ++window, ++own) {
-        if (!*window) continue;
-        const int corner = (y * l.stride - l.pad) * l.columns + x * l.stride - l.pad;
-        float sums[kLanes];
-        sum_window(l, *window, corner, offsets, l.weights + f, l.bias + f, sums);
-        for (int i = 0; i < kLanes; ++i) own[i * outs] = sums[i];
-      }
-  }
-}
-
 // --- Python ---
 
 // The memory of an argument; released at the end.
@@ -690,52 +589,7 @@ PyObject* distances(PyObject*, PyObject* args) {
   }
 }
 
-// Whether sum_window() is fast here.
-bool fuses() {
-#if defined(__x86_64__) && defined(__GNUC__)
-  return __builtin_cpu_supports("fma") && __builtin_cpu_supports("avx2");
-#elif defined(__aarch64__) || defined(__FMA__)
-  return true;
-#else
-  return false;
-#endif
-}
-
-PyObject* has_fused(PyObject*, PyObject*) { return PyBool_FromLong(fuses()); }
-
-PyObject* first_layer(PyObject*, PyObject* args) {
-  Buffer raster, nothing, values, weights, bias, out;
-  Layer l{};
-  if (!PyArg_ParseTuple(args, "y*y*y*y*y*w*iiiiii", &raster.view, &nothing.view, &values.view, &weights.view,
-                        &bias.view, &out.view, &l.planes, &l.rows, &l.columns, &l.size, &l.stride, &l.pad))
-    return nullptr;
-  const Py_ssize_t single = sizeof(float), filters = bias.view.len / single;
-  const auto within = [](int value, int least, int most) { return value >= least && value <= most; };
-  if (!within(l.planes, 1, kMostPlanes) || !within(l.rows, 1, kMostCells) || !within(l.columns, 1, kMostCells) ||
-      !within(l.size, 1, 8) || !within(l.stride, 1, 16) || !within(l.pad, 0, l.size - 1) || filters < 1 ||
-      filters > 1024 || filters % kLanes || l.rows + 2 * l.pad < l.size || l.columns + 2 * l.pad < l.size)
-    return refuse("layer: not one that this was compiled for");
-  l.filters = static_cast<int>(filters);
-  l.out_rows = (l.rows + 2 * l.pad - l.size) / l.stride + 1;
-  l.out_columns = (l.columns + 2 * l.pad - l.size) / l.stride + 1;
-  if (raster.view.len != Py_ssize_t{l.planes} * l.rows * l.columns || nothing.view.len != l.planes ||
-      values.view.len != 256 * single * l.planes ||
-      weights.view.len != single * l.planes * l.size * l.size * l.filters ||
-      out.view.len != single * l.filters * l.out_rows * l.out_columns)
-    return refuse("layer: raster, weights and output differ in size");
-  l.raster = raster.as<std::uint8_t>();
-  l.values = values.as<float>(), l.weights = weights.as<float>(), l.bias = bias.as<float>();
-  try {
-    convolve(l, nothing.as<std::uint8_t>(), static_cast<float*>(out.view.buf));
-  } catch (const std::exception&) {
-    return PyErr_NoMemory();
-  }
-  Py_RETURN_NONE;
-}
-
 PyMethodDef methods[] = {
-    {"has_fused", has_fused, METH_NOARGS, nullptr},
-    {"first_layer", first_layer, METH_VARARGS, nullptr},
     {"refine", refine, METH_VARARGS, nullptr},
     {"distances", distances, METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},

@@ -5,16 +5,11 @@ As :mod:`lanenet.perception.edges.compiled`; the callers explain each step, and 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float
 
 from lanenet.perception.edges.compiled import if_current
 from lanenet.perception.edges.road import RoadEdges
-
-if TYPE_CHECKING:
-    from lanenet.perception.network.first_layer import FirstLayer
 
 try:
     from lanenet.perception.network import _kernels  # type: ignore[attr-defined]
@@ -47,25 +42,6 @@ def refine(
     lines = np.ascontiguousarray(asked, np.float64)
     found = _kernels.refine(lines, *seen, numbers, edges.points_cm.dtype == np.float32)
     return np.frombuffer(found).reshape(-1, _PER_LINE)
-
-
-def is_fused() -> bool:
-    """Tell whether :func:`first_layer` is there, and fast: it multiplies and adds in one step."""
-    return is_here() and bool(_kernels.has_fused())
-
-
-def first_layer(
-    layer: FirstLayer, raster: UInt8[np.ndarray, "p r c"], out: Float32[np.ndarray, "f y x"]
-) -> None:
-    """Convolve a raster as the ``DequantizeLinear`` and the ``Conv`` of ONNX do, by its filled cells.
-
-    Args:
-        layer: See :class:`lanenet.perception.network.first_layer.FirstLayer`.
-        raster: Contiguous.
-        out: Contiguous; written.
-    """
-    numbers = layer.nothing, layer.values, layer.weights, layer.bias
-    _kernels.first_layer(raster, *numbers, out, *layer.shape, layer.size, layer.stride, layer.pad)
 
 
 def distances(

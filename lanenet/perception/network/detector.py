@@ -17,7 +17,7 @@ from lanenet.geometry.lane import ROWS_CM, lane_width_cm, parabola_through, prop
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
-from lanenet.perception.network.first_layer import ANSWERS, open_network
+from lanenet.perception.network.compact.network import ANSWERS, open_network
 from lanenet.perception.network.lane_belief import Keep
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta
 from lanenet.perception.network.tracker import LaneTracker

@@ -1,0 +1,1 @@
+"""The compact networks without onnxruntime, in compiled loops."""
