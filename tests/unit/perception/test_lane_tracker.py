@@ -101,7 +101,17 @@ def test_one_line_that_is_seen_tells_where_the_other_one_is():
     guess = straight + np.array([1.0] * 3 + [4.0] * 3)
     points_cm, sigma_cm, seen_cm = tracker.follow(guess, unsure, SEEN, edges_of(straight, sides=(0,)))
     np.testing.assert_allclose(points_cm, straight, atol=0.2)
-    assert seen_cm[1] == 0.0 and sigma_cm[3:].max() < 2.0
+    # The network says something else: that counts.
+    assert seen_cm[1] == 0.0 and 2.0 < sigma_cm[3:].max() < 3.0
+
+
+@pytest.mark.parametrize(("off_cm", "sigma_cm"), [(0.0, 0.2), (1.0, 0.6), (3.0, 1.8)])
+def test_sigma_tells_how_far_the_line_is_from_the_networks_own(off_cm, sigma_cm):
+    straight = np.array([-20.0] * 3 + [20.0] * 3)
+    edges = edges_of(straight)
+    points_cm, found_cm, _ = LaneTracker(LaneMemory(LANE_CM)).follow(straight + off_cm, SURE, SEEN, edges)
+    np.testing.assert_allclose(points_cm, straight, atol=0.3)
+    np.testing.assert_allclose(found_cm, sigma_cm, atol=0.2)
 
 
 @pytest.mark.parametrize("painted", [True, False])
