@@ -17,6 +17,7 @@ from lanenet.geometry.lane import ROWS_CM, lane_width_cm, parabola_through, prop
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
+from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.compact.network import ANSWERS, open_network
 from lanenet.perception.network.lane_belief import Keep
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta
@@ -97,7 +98,7 @@ class NetworkDetector:
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self._told, self._keeps = False, keeps
         self.memory = LaneMemory(lane_width_cm, self.meta.widths_cm)
-        self._tracker = LaneTracker(self.memory, keep, lambda line_cm: _sees(camera, line_cm))
+        self._tracker = LaneTracker(self.memory, keep, CameraView(camera))
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
         self._raster = new_raster(self.meta.window, self.meta.planes)
         self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster[None]}
@@ -184,16 +185,6 @@ class NetworkDetector:
         """Forget the lane and its markings; its width stays likely, since most roads stay the same."""
         self.memory.doubt()
         self._tracker.reset()
-
-
-#: y of the places at which a line has to be in the image to be in sight, and which share of them. Chosen.
-_PLACES_CM, _IN_SIGHT = np.arange(15.0, 41.0, 5.0), 0.6
-
-
-def _sees(camera: Camera, line_cm: Float[np.ndarray, "3"]) -> bool:
-    """Return whether most of a line, given by its points at the label rows, is in a camera's image."""
-    x = np.polyval(parabola_through(*line_cm.tolist()), _PLACES_CM)
-    return bool(camera.shows_ground(np.stack([x, _PLACES_CM], axis=1)).mean() >= _IN_SIGHT)
 
 
 def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:

@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from lanenet.onboard.bench import example_camera
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
+from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.straight_on import SeenLines, StraightOn, turns_away_cm
 from lanenet.perception.network.tracker import LaneTracker
 
@@ -142,7 +144,7 @@ def borders_of(lines_cm: dict[int, np.ndarray]) -> RoadEdges:
 
 def drive_into_a_side_road(goes_on: bool) -> tuple[LaneTracker, np.ndarray]:
     """The right line turns away 20 cm ahead; the left one goes on in parallel, or has ended."""
-    tracker = LaneTracker(LaneMemory(WIDTH_CM), sees=lambda line_cm: True)
+    tracker = LaneTracker(LaneMemory(WIDTH_CM), view=CameraView(example_camera()))
     y = np.arange(-5.0, 46.0, 1.0)
     straight = borders_of({0: np.full_like(y, -20.0), 1: np.full_like(y, 20.0)})
     sigma_cm, certain = np.full(6, 0.8), np.ones(2)
