@@ -374,7 +374,6 @@ WIDE void mark_peaks(const int32_t* APART here, int stride, const int16_t* APART
 // OpenCV's Canny on s.dx and dy: the flat indices of its edges go to s.candidates, in rows.
 void trace_edges(Scratch& s, int height, int width, double low_threshold, double high_threshold,
                  const uint8_t* keep) {
-  if (low_threshold > high_threshold) std::swap(low_threshold, high_threshold);
   const int low = squared_threshold(low_threshold), high = squared_threshold(high_threshold);
   const int stride = width + 2;
   s.marks.assign(static_cast<size_t>(stride) * (height + 2) + kBlock, kNone);

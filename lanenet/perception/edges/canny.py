@@ -7,7 +7,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lanenet.config import Settings
 from lanenet.errors import CalibrationError, DriveFormatError
@@ -58,6 +58,12 @@ class EdgeSettings(Settings):
     contrast_share: float = Field(default=0.3, ge=0.0, lt=1.0)
     colour_weight: float = Field(default=0.0, ge=0.0, le=1.0)
     colour: ColourSettings = ColourSettings()
+
+    @model_validator(mode="after")
+    def _check_order(self) -> EdgeSettings:
+        if self.low > self.high:
+            raise ValueError(f"expected low at most high, found {self.low:g} above {self.high:g}")
+        return self
 
 
 def find_edges(

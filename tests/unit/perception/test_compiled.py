@@ -23,11 +23,10 @@ pytestmark = pytest.mark.skipif(not compiled.is_here(), reason="installed withou
 CAMERA = smaller_camera(example_camera(), 4)
 TABLE = RoadTable(CAMERA, RangeSettings())
 EDGES = st.builds(
-    EdgeSettings,
+    lambda thresholds, **others: EdgeSettings(low=min(thresholds), high=max(thresholds), **others),
+    thresholds=st.tuples(st.floats(0.5, 300.0), st.floats(0.5, 300.0)),
     method=st.sampled_from(["canny", "directional"]),
     blur_px=st.sampled_from([0, 3, 5]),
-    low=st.floats(0.5, 300.0),
-    high=st.floats(0.5, 300.0),
     contrast_share=st.sampled_from([0.0, 0.3, 0.95]),
     colour_weight=st.sampled_from([0.0, 0.333, 0.75, 1.0]),
 )

@@ -171,6 +171,11 @@ def test_a_step_below_the_threshold_is_no_edge() -> None:
     assert len(find_edges(faint, EdgeSettings(low=5.0, high=10.0)).uv_px) > 0
 
 
+def test_the_lower_threshold_is_not_above_the_upper_one() -> None:
+    with pytest.raises(ValueError, match="expected low at most high, found 90 above 80"):
+        EdgeSettings(low=90.0)
+
+
 def test_a_bright_tape_raises_the_threshold_for_soft_edges() -> None:
     # A soft edge at u = 20 that passes the fixed thresholds, and a strong one at u = 60.
     soft, _, _ = blurred_step(0.0, -19.5, dark=40.0, bright=85.0)
