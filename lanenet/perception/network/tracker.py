@@ -93,7 +93,7 @@ _HIDDEN = 0.08
 #: The sigma that is answered is this share of all these together and of what labels are wrong by, [cm]. A
 #: line's own sigma was too large where line and network agree, and too small elsewhere: on 144 simulated
 #: drives of six seeds the mean pinball loss of 72 and 94 % is 0.30 instead of 0.36. A share of 0.55 fits
-#: these best (76 and 94 % of the errors within one sigma and two), but real roads are harder: chosen for them.
+#: these best (76 and 94 % of the errors within one sigma and two), but real roads are harder.
 _CLAIMED, _LABEL_CM = 0.62, 0.2
 #: What it costs at most that a marking has another hue than its line had. Tried: 0, 15 and 40, which makes up
 #: for a line and loses those in the light of a lamp.
