@@ -19,6 +19,7 @@ from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges import compiled
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 from lanenet.perception.network import compiled as network_compiled
+from lanenet.perception.network.compact import network as compact
 
 State = Literal["ok", "note", "problem"]
 
@@ -185,12 +186,10 @@ def _opencv() -> Check:
 
 
 def _kernels() -> Check:
-    if compiled.is_here() and network_compiled.is_here():
-        return Check("edges", "ok", "by compiled loops")
-    text = (
-        "by NumPy and OpenCV, the same but slower: install g++ and the headers of Python, then lanenet again"
-    )
-    return Check("edges", "note", text)
+    if compiled.is_here() and network_compiled.is_here() and compact.is_here():
+        return Check("compiled loops", "ok", "for edges, lines and networks")
+    text = "not here: the same answers, slower; install g++ and the headers of Python, then lanenet again"
+    return Check("compiled loops", "note", text)
 
 
 def _onnxruntime() -> Check:
