@@ -37,7 +37,7 @@ def test_bench_refuses_a_missing_model(tmp_path: Path) -> None:
 
 def test_this_installation_is_in_order() -> None:
     checks = {check.name: check for check in run_checks()}
-    assert {"python", "lanenet", "packages", "extra train", "opencv", "edges", "onnxruntime"} <= set(checks)
+    assert {"python", "lanenet", "packages", "extra train", "opencv", "compiled loops", "onnxruntime"} <= set(checks)
     assert [c for c in checks.values() if c.state == "problem"] == []
 
 
@@ -56,7 +56,7 @@ def test_broken_runtime_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_it_says_whether_the_compiled_loops_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     for kernels, state in ((object(), "ok"), (None, "note")):
         monkeypatch.setattr(compiled, "_kernels", kernels)
-        assert {check.name: check.state for check in run_checks()}["edges"] == state
+        assert {check.name: check.state for check in run_checks()}["compiled loops"] == state
 
 
 def test_good_camera_sees_the_road(tmp_path: Path) -> None:
