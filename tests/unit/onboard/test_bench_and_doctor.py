@@ -37,7 +37,8 @@ def test_bench_refuses_a_missing_model(tmp_path: Path) -> None:
 
 def test_this_installation_is_in_order() -> None:
     checks = {check.name: check for check in run_checks()}
-    assert {"python", "lanenet", "packages", "extra train", "opencv", "compiled loops", "onnxruntime"} <= set(checks)
+    expected = {"python", "lanenet", "packages", "extra train", "opencv", "compiled loops", "onnxruntime"}
+    assert expected <= set(checks)
     assert [c for c in checks.values() if c.state == "problem"] == []
 
 
