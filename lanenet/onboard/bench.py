@@ -62,7 +62,7 @@ def time_stages(
         camera: Camera whose frames are imitated.
         model: Network to time as well; with any camera, since only its speed matters here.
         rounds: Timed frames.
-        threads: Threads of OpenCV and onnxruntime.
+        threads: Threads of OpenCV and onnxruntime; compiled loops have one.
         progress: Called with (frames done, frames).
 
     Returns:
@@ -123,7 +123,7 @@ def time_paths(
         camera: Camera whose frames are imitated; every path gets the same ones.
         models: Networks; with any camera, since only their speed matters here.
         rounds: Timed frames per path.
-        threads: Threads of OpenCV and onnxruntime.
+        threads: Threads of OpenCV and onnxruntime; compiled loops have one.
         progress: Called with (frames done, frames).
 
     Returns:

@@ -13,7 +13,7 @@ from lanenet.geometry.lane import ROWS_CM, parabola_through
 #: y of the places at which a line has to be in the image to be in sight, and which share of them. Chosen.
 _PLACES_CM, _IN_SIGHT = np.arange(15.0, 41.0, 5.0), 0.6
 #: Ground that is looked at, to both sides and ahead, and in which steps: to the sides as far as a line of the
-#: car's lane may lie, ahead as far as the networks' windows. Chosen.
+#: car's lane may lie, ahead about as far as the networks' windows. Chosen.
 _ASIDE_CM, _AHEAD_CM, _STEP_CM = 120.0, 95.0, 2.5
 
 
@@ -36,11 +36,11 @@ class CameraView:
         return bool(self._camera.shows_ground(np.stack([x, _PLACES_CM], axis=1)).mean() >= _IN_SIGHT)
 
     def hidden_cm(self, row: int, x_cm: float) -> float:
-        """Return how far ahead of a place the image begins; 0 in the image.
+        """Return how far ahead of a place the image begins; 0 where that is behind it.
 
         Args:
             row: Number of the place's label row.
-            x_cm: Its x, frame car.
+            x_cm: Its x, frame car. Where nothing is in the image, it counts as beginning 95 cm ahead.
         """
         if not math.isfinite(x_cm):
             return 0.0

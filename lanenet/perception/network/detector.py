@@ -79,7 +79,7 @@ class NetworkDetector:
             camera: The car's camera. Edges are found as the model's training images had them.
             any_camera: Accept a camera that the model was not trained with. Bird's-eye rasters of two
                 calibrated cameras look alike, but not where one of them sees more.
-            threads: Threads of the computation.
+            threads: Threads of onnxruntime, for a network that it runs.
             mask: Nonzero on the car itself: edges there are left out, beside what the model's own settings
                 leave out.
             lane_width_cm: The lane's width if it is known; a network with an input for it gets it. None takes

@@ -81,10 +81,10 @@ _TELLS_WIDTH_CM = 15.0
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
 #: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
 _BARELY_CM, _AHEAD = 2.0, 3.0
-#: A point is unknown if its sigma is above this share of the lane's width, or of the likely one. What lies
-#: between a line and the network's own answer, 15 cm ahead and at the point itself, counts with the sigma: on
-#: 120 simulated drives the RMSE is 1.22 cm for it, with the distance 15 cm ahead alone 1.41, and 0.4 % fewer
-#: points are answered. Tried: 0.14, 0.16 and 0.18 gave 1.22, 1.27 and 1.31 cm, 96.1, 96.4 and 96.6 %.
+#: A point is unknown if the sigma of its line is above this share of the lane's width, or of the likely one.
+#: What lies between a line and the network's own answer, 15 cm ahead and at the point itself, counts with it:
+#: on 120 simulated drives the RMSE is 1.22 cm for it, with the distance 15 cm ahead alone 1.41, and 0.4 %
+#: fewer points are answered. Tried: 0.14, 0.16 and 0.18 gave 1.22, 1.27 and 1.31 cm, 96.1, 96.4 and 96.6 %.
 _MOST_LANES = 0.16
 #: Where a line is out of view beside the car, this share of the distance to where it comes into view counts
 #: as well: of the errors 10 cm and more out of view 92 and 92 % lay within two sigma on two real drives, and
@@ -92,8 +92,9 @@ _MOST_LANES = 0.16
 _HIDDEN = 0.08
 #: The sigma that is answered is this share of all these together and of what labels are wrong by, [cm]. A
 #: line's own sigma was too large where line and network agree, and too small elsewhere: on 144 simulated
-#: drives of six seeds the mean pinball loss of 72 and 94 % is 0.30 instead of 0.36. A share of 0.55 fits
-#: these best (76 and 94 % of the errors within one sigma and two), but real roads are harder.
+#: drives of six seeds the mean pinball loss of 72 and 94 %, which lie between those of a normal distribution
+#: and what heavy tails leave, is 0.30 instead of 0.36. A share of 0.55 fits these best, but real roads are
+#: harder: see docs/learning.md.
 _CLAIMED, _LABEL_CM = 0.62, 0.2
 #: What it costs at most that a marking has another hue than its line had. Tried: 0, 15 and 40, which makes up
 #: for a line and loses those in the light of a lamp.

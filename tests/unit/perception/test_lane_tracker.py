@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lanenet.geometry.lane import parabolas_from_points
+from lanenet.onboard.bench import example_camera
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
+from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.refinement import RoadBorders, refine_lines
 from lanenet.perception.network.tracker import LaneTracker, distances_cm
 
@@ -105,13 +109,36 @@ def test_one_line_that_is_seen_tells_where_the_other_one_is():
     assert seen_cm[1] == 0.0 and 2.0 < sigma_cm[3:].max() < 3.0
 
 
-@pytest.mark.parametrize(("off_cm", "sigma_cm"), [(0.0, 0.2), (1.0, 0.6), (3.0, 1.8)])
-def test_sigma_tells_how_far_the_line_is_from_the_networks_own(off_cm, sigma_cm):
+def sigma_15_cm_ahead(off_cm: float) -> float:
+    """That of the left line, where the network's own answer lies so far beside it."""
     straight = np.array([-20.0] * 3 + [20.0] * 3)
-    edges = edges_of(straight)
-    points_cm, found_cm, _ = LaneTracker(LaneMemory(LANE_CM)).follow(straight + off_cm, SURE, SEEN, edges)
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    points_cm, sigma_cm, _ = tracker.follow(straight + off_cm, SURE, SEEN, edges_of(straight))
     np.testing.assert_allclose(points_cm, straight, atol=0.3)
-    np.testing.assert_allclose(found_cm, sigma_cm, atol=0.2)
+    return float(sigma_cm[1])
+
+
+def test_sigma_tells_how_far_the_line_is_from_the_networks_own():
+    none_cm = sigma_15_cm_ahead(0.0)
+    # Labels are never better than 0.2 cm, and three fifths of all that is told.
+    assert 0.62 * 0.2 < none_cm < 0.3
+    for off_cm in (1.0, 3.0):
+        np.testing.assert_allclose(
+            sigma_15_cm_ahead(off_cm), np.hypot(none_cm, 0.62 * off_cm), rtol=0.02, atol=0.01
+        )
+
+
+def test_sigma_tells_how_far_out_of_view_the_line_is():
+    straight = np.array([-20.0] * 3 + [20.0] * 3)
+    camera = example_camera()
+    view = CameraView(replace(camera, mounting=replace(camera.mounting, ahead_of_front_axle_cm=40.0)))
+    hidden_cm = view.hidden_cm(0, -20.0)
+    assert hidden_cm > 5.0
+    seen, hidden = (
+        LaneTracker(LaneMemory(LANE_CM), view=each).follow(straight, SURE, SEEN, edges_of(straight))[1][0]
+        for each in (None, view)
+    )
+    np.testing.assert_allclose(hidden, np.hypot(seen, 0.62 * 0.08 * hidden_cm), rtol=1e-6)
 
 
 @pytest.mark.parametrize("painted", [True, False])

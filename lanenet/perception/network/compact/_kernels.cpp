@@ -27,9 +27,12 @@ namespace {
 // Eight numbers at a time, wherever they lie.
 typedef float Eight __attribute__((vector_size(32), aligned(4), may_alias));
 
-// Filters and places at a time; points; and what is at most.
+// Filters and places at a time: their sums fill the registers; points.
 constexpr int kLanes = 16, kSpots = 4, kPoints = 6;
-constexpr int kMostPlanes = 8, kMostSize = 16, kMostCells = 1024, kMostLayers = 16, kMostChannels = 4096;
+// What is at most: of a raster's window (see geometry/birdseye.py), and far beyond any network of ours; values of a
+// map, so that none is counted beyond an int.
+constexpr int kMostCells = 2048, kMostPlanes = 8, kMostSize = 16, kMostLayers = 16, kMostChannels = 4096;
+constexpr Py_ssize_t kMostValues = 1 << 26;
 
 // The sums of 16 filters.
 struct Sums {
@@ -54,8 +57,8 @@ WITHIN void take_positive(Sums& sums) {
   sums.low = sums.low > nothing ? sums.low : nothing, sums.high = sums.high > nothing ? sums.high : nothing;
 }
 
-// Feature maps: the channels of a place lie side by side, and around the places lies a border of zeros. A plain place is
-// what an empty raster would give far from its border, as most of them are: all plain ones are alike.
+// Feature maps: the channels of a place lie side by side, and around the places lies a border of zeros. A plain place
+// is what an empty raster would give far from its border, as most of them are: all plain ones are alike.
 struct Features {
   std::vector<float> values;
   std::vector<std::uint8_t> plain;
@@ -185,8 +188,8 @@ FAST void connect(Features& in, const float* weights, const float* bias, int out
   }
 }
 
-// Points, their sigmas and the presence of both lines, from the last layer's outputs: a distribution over places for each
-// point, its log sigma, and the log odds of both lines. `tail` as in network.py.
+// Points, their sigmas and the presence of both lines, from the last layer's outputs: a distribution over places for
+// each point, its log sigma, and the log odds of both lines. `tail` as in network.py.
 void answer(const float* outputs, const float* tail, int bins, double* found) {
   const float *factors = tail + 2, *places = factors + kPoints, *spread = outputs + kPoints * bins;
   for (int i = 0; i < kPoints; ++i, outputs += bins) {
@@ -221,7 +224,7 @@ struct Buffer {
 // Adds what a lane's width adds to the biases, by how near it is to each of some widths.
 void tell_width(double width_cm, double sigma, const Buffer& log_widths, const float* by_width,
                 std::vector<float>& biases) {
-  const double log_width = std::log(std::max(width_cm, 1.0));
+  const double log_width = std::log(width_cm);
   for (Py_ssize_t k = 0; k < log_widths.size<float>(); ++k, by_width += biases.size()) {
     const double off = (log_width - log_widths.as<float>()[k]) / sigma;
     const float near = static_cast<float>(std::exp(-0.5 * off * off));
@@ -257,17 +260,24 @@ PyObject* run(PyObject*, PyObject* args) {
   const Py_ssize_t n_first = Py_ssize_t{l.planes} * l.size * l.size * sizes[0];
   Py_ssize_t n_weights = n_first, n_biases = sizes[0];
   int last_rows = rows, last_columns = columns;
+  const auto fits = [&](int channels) {
+    return Py_ssize_t{last_rows + 2} * (last_columns + 2) * channels <= kMostValues;
+  };
+  sound = fits(sizes[0]);
   for (int i = 1; i < layers; ++i) {
     n_weights += Py_ssize_t{9} * sizes[i - 1] * sizes[i], n_biases += sizes[i];
     last_rows = (last_rows + 1) / 2, last_columns = (last_columns + 1) / 2;
+    sound &= fits(sizes[i]);
   }
+  if (!sound) return refuse("network: not one that this was compiled for");
   const Py_ssize_t n_hidden = Py_ssize_t{last_rows} * last_columns * sizes[layers - 1] * hidden;
-  const int bins = static_cast<int>(tail.size<float>()) - 2 - kPoints;
+  const Py_ssize_t bins = tail.size<float>() - 2 - kPoints;
   if (raster.view.len != Py_ssize_t{l.planes} * l.rows * l.columns || nothing.view.len != l.planes ||
       values.size<float>() != 256 * l.planes ||
       weights.size<float>() != n_weights + n_hidden + Py_ssize_t{hidden} * outputs ||
       biases.size<float>() != n_biases + hidden + outputs ||
-      by_width.size<float>() != log_widths.size<float>() * biases.size<float>() || bins < 1 || kPoints * (bins + 1) + 2 > outputs ||
+      by_width.size<float>() != log_widths.size<float>() * biases.size<float>() || bins < 1 || bins > outputs ||
+      (kPoints * (bins + 1) + 2 + kLanes - 1) / kLanes * kLanes != outputs ||
       found.size<double>() != 2 * kPoints + 2)
     return refuse("network: raster, weights and answers differ in size");
   l.raster = raster.as<std::uint8_t>(), l.nothing = nothing.as<std::uint8_t>(), l.values = values.as<float>();
@@ -294,7 +304,7 @@ PyObject* run(PyObject*, PyObject* args) {
     for (int i = 0; i < hidden; ++i) unit[i] = std::max(unit[i], 0.0f);
     out.resize(outputs);
     connect(units, w + n_hidden, b + hidden, outputs, out.data());
-    answer(out.data(), tail.as<float>(), bins, static_cast<double*>(found.view.buf));
+    answer(out.data(), tail.as<float>(), static_cast<int>(bins), static_cast<double*>(found.view.buf));
   } catch (const std::exception&) {
     return PyErr_NoMemory();
   }

@@ -44,6 +44,9 @@ log = logging.getLogger(__name__)
 
 #: What a detector asks a network for.
 ANSWERS = ("points_cm", "sigma_cm", "presence")
+_ANSWERS_AT = dict(
+    zip(ANSWERS, (slice(N_POINTS), slice(N_POINTS, 2 * N_POINTS), slice(2 * N_POINTS, None)), strict=True)
+)
 #: Sigma, in log width, of the Gaussians by which a network is told a lane's width: about the distance of two
 #: neighbours among those of :mod:`lanenet.learn.network`, log(4/3).
 WIDTH_SIGMA = 0.25
@@ -54,6 +57,8 @@ SIGMA_RANGE_CM = (0.05, 50.0)
 _LANES = 16
 #: Filled share of a raster, and lane widths, by which a network is compared with onnxruntime. Chosen.
 _FILLED, _COMPARED_CM = 0.05, (0.0, 40.0)
+#: Of an answer, what rounding may change. Chosen: some hundred times single precision.
+_ROUNDING = 1e-5
 
 
 @runtime_checkable
@@ -78,12 +83,15 @@ def open_network(path: Path, threads: int = 1) -> tuple[Runs, ModelMeta]:
     """
     data, where = read_model(path)
     session, meta = check_model(data, where, threads, frames=1)
-    weights = read_weights(data, meta) if is_here() else None
+    if not is_here():
+        return session, meta
+    weights = read_weights(data, meta)
     if weights is None:
+        log.info("%s: not of the layers of a compact network: left to onnxruntime", where)
         return session, meta
     compact = CompactNetwork(weights)
     if not _agree(compact, session, meta):
-        log.warning("%s: the compiled loops answer otherwise: it is left to onnxruntime, slower", where)
+        log.warning("%s: the compiled loops answer otherwise, or not: left to onnxruntime, slower", where)
         return session, meta
     return compact, meta
 
@@ -124,37 +132,45 @@ class CompactNetwork:
 
     def __init__(self, weights: Weights) -> None:
         """Take the weights."""
-        found = np.zeros(2 * N_POINTS + len(SIDES))
-        points_cm, sigma_cm, presence = np.split(found[None], [N_POINTS, 2 * N_POINTS], axis=1)
-        self._answers = {"points_cm": points_cm, "sigma_cm": sigma_cm, "presence": presence}
+        self._shape = (1, *weights.shape)
         layers = weights.filters, weights.biases, weights.log_widths, weights.width_biases, weights.channels
-        sizes = *weights.shape, *weights.window
-        self._numbers = weights.nothing, weights.values, *layers, weights.tail, WIDTH_SIGMA, found, *sizes
+        self._numbers = weights.nothing, weights.values, *layers, weights.tail, WIDTH_SIGMA
+        self._sizes = *weights.shape, *weights.window
 
     def run(self, names: Sequence[str], feed: dict[str, np.ndarray]) -> Sequence[Any]:
         """Return some of ``ANSWERS`` for one raster, and the lane's width where the model takes it.
 
-        The next run overwrites them.
+        Raises:
+            ValueError: If the raster is not one of the model's.
         """
+        raster = feed[INPUT_NAME]
+        if raster.shape != self._shape or raster.dtype != np.uint8:
+            raise ValueError(f"raster: expected uint8 {self._shape}, found {raster.dtype} {raster.shape}")
         width_cm = feed[WIDTH_NAME][0] if WIDTH_NAME in feed else 0.0
-        _kernels.run(feed[INPUT_NAME], width_cm, *self._numbers)
-        return [self._answers[name] for name in names]
+        found = np.empty((1, 2 * N_POINTS + len(SIDES)))
+        _kernels.run(raster, width_cm, *self._numbers, found, *self._sizes)
+        return [found[:, _ANSWERS_AT[name]] for name in names]
 
 
 def _agree(compact: CompactNetwork, whole: Runs, meta: ModelMeta) -> bool:
-    """Compare the two on a raster in which some cells hold anything."""
+    """Compare the two on a raster of which some cells hold anything; False if the loops lack a layer."""
     rng = np.random.default_rng(0)
-    filled = rng.random((meta.window.rows, meta.window.columns)) < _FILLED
-    looks = rng.integers(MIDDLE - STEPS, MIDDLE + STEPS + 1, (1, meta.planes, *filled.shape))
-    raster = np.where(filled, looks, MIDDLE).astype(np.uint8)
-    raster[0, 0] = np.where(filled, 255, 0)
+    shape = meta.planes, meta.window.rows, meta.window.columns
+    looks = rng.integers(MIDDLE - STEPS, MIDDLE + STEPS + 1, (1, *shape))
+    raster = np.where(rng.random(shape[1:]) < _FILLED, looks, MIDDLE).astype(np.uint8)
+    # Its own cells, so that none of the planes alone tells which are filled.
+    raster[0, 0] = np.where(rng.random(shape[1:]) < _FILLED, 255, 0)
     feeds: list[dict[str, np.ndarray]] = [{INPUT_NAME: raster}]
     if meta.takes_width:
         feeds += [{INPUT_NAME: raster, WIDTH_NAME: np.array([w], np.float32)} for w in _COMPARED_CM]
     for feed in feeds:
-        for ours, theirs in zip(compact.run(ANSWERS, feed), whole.run(ANSWERS, feed), strict=True):
+        try:
+            answers = compact.run(ANSWERS, feed)
+        except (ValueError, OverflowError):
+            return False
+        for ours, theirs in zip(answers, whole.run(ANSWERS, feed), strict=True):
             # Written so that NaN fails as well.
-            if not (np.abs(ours - theirs) <= SELF_TEST_TOLERANCE).all():
+            if not (np.abs(ours - theirs) <= SELF_TEST_TOLERANCE + _ROUNDING * np.abs(theirs)).all():
                 return False
     return True
 
@@ -207,12 +223,12 @@ def _weights(graph: Graph, meta: ModelMeta) -> Weights:
     return Weights(
         (meta.planes, meta.window.rows, meta.window.columns),
         (size, stride, pad),
-        np.ascontiguousarray(zero),
+        zero.copy(),
         off.astype(np.float32) * scale[:, None],
         np.concatenate([_in_blocks(kernel, n) for kernel, n in zip(kernels, n_inputs, strict=False)]),
         np.concatenate(biases),
         np.array(channels, np.int32),
-        log_widths,
+        log_widths.copy(),
         width_biases,
         _tail(graph.constants["network.bins_cm"], graph.constants["network.sigma_factor"]),
     )

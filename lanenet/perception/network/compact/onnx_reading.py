@@ -1,4 +1,4 @@
-"""The nodes and constants of ONNX files, read without a library, which the car has none for.
+"""The nodes and constants of ONNX files, read without the package onnx, which the car does not have.
 
 An ONNX file is a message of Protocol Buffers: fields with a number, one after the other, whose values are
 whole numbers or bytes, which may be messages in turn.
@@ -33,7 +33,10 @@ class Node(NamedTuple):
 
 @dataclass(frozen=True)
 class Graph:
-    """The nodes of a graph, in order, and its constants of floats or bytes that are stored as raw data."""
+    """The nodes of a graph, in order, and its constants of floats or bytes that are stored as raw data.
+
+    The constants are views of the file.
+    """
 
     nodes: list[Node]
     constants: dict[str, np.ndarray]
@@ -76,11 +79,8 @@ def _node(message: memoryview) -> Node:
 
 
 def _tensor(message: memoryview) -> np.ndarray | None:
-    kinds, data, shape = (
-        _integers(message, _DATA_TYPE),
-        [bytes(value) for value in _values(message, _RAW_DATA)],
-        _integers(message, _DIMS),
-    )
+    kinds, shape = _integers(message, _DATA_TYPE), _integers(message, _DIMS)
+    data = [*_values(message, _RAW_DATA)]
     if len(kinds) != 1 or kinds[0] not in _NUMPY_TYPES or len(data) != 1:
         return None
     numbers: np.ndarray = np.frombuffer(data[0], _NUMPY_TYPES[kinds[0]])
