@@ -113,6 +113,9 @@ def _rows_of(text: str, title: str) -> Iterable[dict[str, str]]:
 
 
 def _number(cell: str) -> float:
+    """Read a cell; NaN where nothing was answered."""
+    if cell == "-":
+        return math.nan
     return float(cell.rstrip("%")) / 100.0 if cell.endswith("%") else float(cell)
 
 
@@ -137,7 +140,7 @@ def leaderboard(results: Sequence[Result]) -> list[TextTable]:
         without = next(result for result in here if result.detector == WITHOUT)
         for result in here:
             ratios.setdefault(result.detector, {})[track] = times_worse(result, without)
-        here.sort(key=lambda result: ratios[result.detector][track])
+        here.sort(key=lambda result: _last_if_unknown(ratios[result.detector][track]))
         lines = [
             _line(rank, result, ratios[result.detector][track]) for rank, result in enumerate(here, start=1)
         ]
@@ -150,24 +153,35 @@ def leaderboard(results: Sequence[Result]) -> list[TextTable]:
         )
         tables.append(TextTable(f"## {track}, in cm", header, lines, note, texts=2))
     # Over tracks, ratios are averaged by their logarithms.
-    means = {
-        name: math.exp(sum(map(math.log, by_track.values())) / len(by_track))
-        for name, by_track in ratios.items()
-        if len(by_track) == len(tracks)
-    }
+    means = {}
+    for name, by_track in ratios.items():
+        known = [times for times in by_track.values() if not math.isnan(times)]
+        if len(by_track) == len(tracks) and known:
+            means[name] = math.exp(sum(map(math.log, known)) / len(known))
     lines = [
-        [str(rank), NAMES.get(name, name), f"{means[name]:.2f}", *(f"{ratios[name][t]:.2f}" for t in tracks)]
+        [str(rank), NAMES.get(name, name), f"{means[name]:.2f}", *(_ratio(ratios[name][t]) for t in tracks)]
         for rank, name in enumerate(sorted(means, key=lambda name: means[name]), start=1)
     ]
-    note = "RMSE over that of the network without the track, on the points that both answer; mean: geometric"
+    note = (
+        "RMSE over that of the network without the track, on the points that both answer; mean: geometric, "
+        "of the tracks on which there are such points"
+    )
     return [
         TextTable("## All tracks", ["rank", "detector", "mean", *tracks], lines, note, texts=2),
         *tables,
     ]
 
 
+def _last_if_unknown(times: float) -> float:
+    return math.inf if math.isnan(times) else times
+
+
+def _ratio(times: float) -> str:
+    return "-" if math.isnan(times) else f"{times:.2f}"
+
+
 def _line(rank: int, result: Result, times: float) -> list[str]:
-    cells = [str(rank), NAMES.get(result.detector, result.detector), f"{times:.2f}"]
+    cells = [str(rank), NAMES.get(result.detector, result.detector), _ratio(times)]
     own = result.answered
     cells += [show_share(own.share), *map(show_cm, (own.rmse_cm, own.median_cm, own.p95_cm))]
     if result.shared is None or result.network is None:

@@ -47,7 +47,8 @@ def test_a_table_with_the_figures_of_the_page_ranks_alike_and_another_start_is_l
                 writer.writerow(row)
                 # Rows of some distances ahead are no result of their own.
                 writer.writerow({**row, "rows": "y = 0"})
-    assert results_of_table(table, "9360933b") == results
+    # Told apart by what they say, since NaN, of a detector without an answer, is not equal to itself.
+    assert list(map(repr, results_of_table(table, "9360933b"))) == list(map(repr, results))
     from_table, from_page = report(PAGE, table), report(PAGE, tmp_path / "none.csv")
     assert from_table.split("\n## ")[1:] == from_page.split("\n## ")[1:]
     assert "the table that `make left-out` keeps" in from_table
@@ -56,9 +57,9 @@ def test_a_table_with_the_figures_of_the_page_ranks_alike_and_another_start_is_l
 def test_who_is_silent_where_it_is_hard_does_not_lead():
     by_name = {r.detector: r for r in results_of_page(PAGE) if r.track == "donkey_circuit"}
     lane_filter, without = by_name["lane-filter"], by_name[WITHOUT]
-    # From the page: 0.71 against 0.98 cm on what each answers, 0.71 against 0.43 cm on the same points.
+    # From the page: 0.73 against 0.95 cm on what each answers, 0.73 against 0.38 cm on the same points.
     assert lane_filter.answered.rmse_cm < without.answered.rmse_cm
-    assert times_worse(lane_filter, without) == pytest.approx(0.71 / 0.43)
+    assert times_worse(lane_filter, without) == pytest.approx(0.73 / 0.38)
 
 
 def test_a_page_of_something_else_is_refused(tmp_path):
