@@ -18,8 +18,8 @@ except ImportError:
 else:
     _kernels = if_current(_kernels)
 
-#: Numbers per line that :func:`refine` returns.
-_PER_LINE = 14
+#: Numbers per line that :func:`refine` returns, and :func:`corners`.
+_PER_LINE, _PER_CORNER = 14, 3
 
 
 def is_here() -> bool:
@@ -42,6 +42,22 @@ def refine(
     lines = np.ascontiguousarray(asked, np.float64)
     found = _kernels.refine(lines, *seen, numbers, edges.points_cm.dtype == np.float32)
     return np.frombuffer(found).reshape(-1, _PER_LINE)
+
+
+def corners(
+    lines: Float[np.ndarray, "m 4"], edges: RoadEdges, numbers: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "m 3"]:
+    """Find the corners at which tape turns off lines, as :mod:`lanenet.perception.network.corner`.
+
+    Args:
+        lines: Of each line its points and the width of its marking.
+        edges: The frame's edge points, all float32 or all float64.
+        numbers: The settings, in the order of ``CornerNumbers`` in ``_kernels.cpp``.
+    """
+    points, normals = np.ascontiguousarray(edges.points_cm), np.ascontiguousarray(edges.normals)
+    asked = np.ascontiguousarray(lines, np.float64)
+    found = _kernels.corners(asked, points, normals, numbers, points.dtype == np.float32)
+    return np.frombuffer(found).reshape(-1, _PER_CORNER)
 
 
 def distances(

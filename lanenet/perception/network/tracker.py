@@ -20,6 +20,7 @@ from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import SEEN, SURE, LaneMemory
 from lanenet.perception.network import compiled
 from lanenet.perception.network.camera_view import CameraView
+from lanenet.perception.network.corner import corners
 from lanenet.perception.network.lane_belief import Keep, LineLooks
 from lanenet.perception.network.line_beside import SeenLine, line_beside
 from lanenet.perception.network.refinement import BASIS, RoadBorders, line_at, refined
@@ -108,6 +109,9 @@ _CHANGED, _SAME = 0.5, 0.3
 _RECALLED = 0.15
 #: Presence below which a line may have ended. On `garage_tape` a blurred one that goes on has 0.67 and more.
 _ENDED = 0.62
+#: So far beyond a corner a line still holds. Tried: 0, 2 and 4 cm refuse 79, 56 and 40 points that are more
+#: than 2 cm off on 144 simulated drives, and 109, 90 and 76 others.
+_CORNER_CM = 2.0
 #: The other line of a bend is found within this share of the width of where it is expected. Chosen.
 _BESIDE = 0.1
 _NOWHERE, _UNSEEN = [False] * len(ROWS_CM), [math.nan] * len(ROWS_CM)
@@ -161,6 +165,7 @@ class _Candidate(NamedTuple):
     seen_at: list[bool]
     look: list[float]
     presence: float = 0.0
+    marking_cm: float = _MARKING_CM
 
 
 #: Points, or sigmas, of the left and of the right line.
@@ -246,6 +251,7 @@ class LaneTracker:
             # A solid line that is not seen ahead turns away there, or ends.
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
                 found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = math.inf
+        self._doubt_beyond_corners(pair, present, borders, found_sigma_cm)
         if decided:
             self._arrive(pair, present)
         if not decided or self._side_is_a_guess(present):
@@ -274,6 +280,31 @@ class LaneTracker:
                 continue
             found_cm[other + i] = told_cm
             found_sigma_cm[other + i] = math.hypot(found_sigma_cm[own + i], self.lane.width_sigma * width_cm)
+
+    def _doubt_beyond_corners(
+        self,
+        pair: tuple[_Candidate, _Candidate],
+        presence: list[float],
+        borders: RoadBorders,
+        found_sigma_cm: list[float],
+    ) -> None:
+        """Make unknown what a line says beyond a corner at which its tape turns off it.
+
+        The lane's other line turns there as well; only one that is seen tells itself where.
+        """
+        seen = [side for side, line in enumerate(pair) if line.seen_cm >= _LINE_SEEN_CM]
+        lines = [pair[side] for side in seen]
+        found = corners([line.points_cm for line in lines], [line.marking_cm for line in lines], borders)
+        for side, corner in zip(seen, found, strict=True):
+            if corner is None:
+                continue
+            ends_cm = {side: corner.ahead_cm + _CORNER_CM}
+            if 1 - side not in seen or presence[1 - side] < SEEN:
+                ends_cm[1 - side] = corner.of_other_cm(side, self.lane.likely_cm)
+            for doubted, end_cm in ends_cm.items():
+                for i, row_cm in enumerate(ROWS_CM, start=len(ROWS_CM) * doubted):
+                    if row_cm > end_cm:
+                        found_sigma_cm[i] = math.inf
 
     def _recall_near(
         self,
@@ -321,8 +352,9 @@ class LaneTracker:
             score_cm = start.score_cm
             score_cm = line.seen_cm + score_cm if line.seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
             score_cm -= _BY_LOOK_CM * self.looks.unlike(start.known_as, line.look)
-            points_cm, sigma_cm, _, seen_cm, seen_at, look = line
-            rated = _Candidate(points_cm, sigma_cm, seen_cm, score_cm, seen_at, look, start.presence)
+            points_cm, sigma_cm, marking_cm, seen_cm, seen_at, look = line
+            as_seen = points_cm, sigma_cm, seen_cm, score_cm, seen_at, look
+            rated = _Candidate(*as_seen, start.presence, marking_cm)
             candidates[start.side].append(rated)
         for side, lines in enumerate(candidates):
             doubt_cm = _BY_PRESENCE_CM * (presence[side] - 0.5)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tapes import tape, turned
 
 from lanenet.geometry.lane import parabolas_from_points
 from lanenet.onboard.bench import example_camera
@@ -288,6 +289,24 @@ def test_where_a_solid_line_is_not_seen_ahead_it_is_not_continued(solid):
     ended = edges.rows()[(edges.points_cm[:, 1] < 21.0) | (edges.points_cm[:, 0] > 0.0)]
     points_cm, _, _ = tracker.follow(BENT, SURE, SEEN, RoadEdges.of_rows(ended))
     assert np.isnan(points_cm).tolist() == [False, False, solid, False, False, False]
+
+
+@pytest.mark.parametrize("other_seen", [True, False])
+def test_nothing_is_answered_beyond_a_corner_of_the_tape(other_seen):
+    lane = np.repeat([-20.0, 20.0], 3)
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for _ in range(12):
+        tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    # The left line turns to the right 22 cm ahead; the network has both straight on.
+    shown = tape(turned(75.0, 22.0), 3.0)
+    if other_seen:
+        right = edges_of(lane, sides=(1,))
+        shown = RoadEdges(
+            np.concatenate([shown.points_cm, right.points_cm]), np.concatenate([shown.normals, right.normals])
+        )
+    points_cm, _, _ = tracker.follow(lane, SURE, np.array([1.0, float(other_seen)]), shown)
+    known = [True, True, False, True, True, True] if other_seen else [True, True, False, False, False, False]
+    assert np.isfinite(points_cm).tolist() == known
 
 
 def test_what_passed_out_of_view_beside_the_car_is_recalled():

@@ -1,0 +1,30 @@
+"""The edge points of tapes that are laid along polylines."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from lanenet.perception.edges.road import RoadEdges
+
+
+def tape(path_cm: np.ndarray, marking_cm: float) -> RoadEdges:
+    """Both borders of a tape along a polyline, every half centimetre."""
+    points, normals = [], []
+    for start, end in pairwise(path_cm):
+        length_cm = float(np.hypot(*(end - start)))
+        along = (end - start) / length_cm
+        right = np.array([along[1], -along[0]])
+        middle = start + np.arange(0.25, length_cm, 0.5)[:, None] * along
+        for border in (-0.5, 0.5):
+            points.append(middle + border * abs(marking_cm) * right)
+            normals.append(np.tile(-2.0 * border * np.sign(marking_cm) * right, (len(middle), 1)))
+    return RoadEdges(np.concatenate(points), np.concatenate(normals))
+
+
+def turned(turn_deg: float, corner_cm: float = 60.0) -> np.ndarray:
+    """A line straight ahead that turns to the right."""
+    turn = np.radians(turn_deg)
+    corner = np.array([-20.0, corner_cm])
+    return np.array([[-20.0, 0.0], corner, corner + 80.0 * np.array([np.sin(turn), np.cos(turn)])])
