@@ -32,7 +32,7 @@ namespace {
 
 constexpr int kRows = 3, kNodes = 8, kSteps = 2, kPlaces = 4;  // label rows, nodes, steps, bins beside a row
 constexpr int kMost = 128, kMostBins = 64;                     // edge points of a line, bins along it
-constexpr int kAsked = 10, kPerLine = 14, kPerCorner = 3;      // numbers of a line, before and after
+constexpr int kAsked = 10, kPerLine = 15, kPerCorner = 3;      // numbers of a line, before and after
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 // The settings, as _NUMBERS of refinement.py has them.
@@ -370,6 +370,7 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
   double *place = out, *deviation = out + 3, *look = out + 11;
   out[6] = found[3];
   out[7] = 0.0;
+  out[14] = s.near_cm;
   for (int k = 0; k < kRows; ++k) {
     place[k] = start[k];
     deviation[k] = std::sqrt(prior[k][k]);
@@ -457,6 +458,7 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
       if (seen[0][static_cast<int>(bin)] || seen[1][static_cast<int>(bin)]) out[8 + k] = 1.0;
   }
   if (met == 0) return;
+  out[14] = s.near_cm + s.bin_cm * last;
   look[0] = sign * yellow / met;
   look[1] = sign * red / met;
   look[2] = 1.0 - static_cast<double>(filled) / (last - first);

@@ -19,7 +19,7 @@ else:
     _kernels = if_current(_kernels)
 
 #: Numbers per line that :func:`refine` returns, and :func:`corners`.
-_PER_LINE, _PER_CORNER = 14, 3
+_PER_LINE, _PER_CORNER = 15, 3
 
 
 def is_here() -> bool:
@@ -29,7 +29,7 @@ def is_here() -> bool:
 
 def refine(
     asked: Float[np.ndarray, "m 10"], edges: RoadEdges, numbers: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "m 14"]:
+) -> Float[np.ndarray, "m 15"]:
     """Fit lines to edge points as :func:`lanenet.perception.network.refinement.refined` does.
 
     Args:

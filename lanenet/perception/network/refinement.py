@@ -100,6 +100,7 @@ class RefinedLines(NamedTuple):
         seen_at: Whether a border lies beside each label row, within ``_BESIDE_CM`` along the road.
         look: By how much the marking is yellower and redder than the floor, as a share of the contrast, and
             the share of gaps between its nearest and its farthest border; NaN where nothing was seen.
+        seen_to_cm: y up to which it has borders, frame car.
     """
 
     points_cm: Float[np.ndarray, "m 3"]
@@ -108,6 +109,7 @@ class RefinedLines(NamedTuple):
     seen_cm: Float[np.ndarray, "m"]
     seen_at: Bool[np.ndarray, "m 3"]
     look: Float[np.ndarray, "m 3"]
+    seen_to_cm: Float[np.ndarray, "m"]
 
 
 class _NearEdges(NamedTuple):
@@ -201,11 +203,12 @@ def refine_lines(
         hues = np.full((len(points_cm), 2), np.nan)
     found = refined(np.column_stack([points_cm, sigma_cm, marking_cm, marking_sigma_cm, hues]), borders)
     return RefinedLines(
-        found[:, :3], found[:, 3:6], found[:, 6], found[:, 7], found[:, 8:11] > 0.0, found[:, 11:]
+        *(found[:, :3], found[:, 3:6], found[:, 6], found[:, 7]),
+        *(found[:, 8:11] > 0.0, found[:, 11:14], found[:, 14]),
     )
 
 
-def refined(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> Float[np.ndarray, "m 14"]:
+def refined(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> Float[np.ndarray, "m 15"]:
     """Do :func:`refine_lines` for a table of lines, each apart from the others.
 
     Args:
@@ -315,6 +318,7 @@ def _refine(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> RefinedLi
         (agree[row, column] > 0.0).astype(np.int64),
         ((y[row, column] - _NEAR_CM) / _BIN_CM).astype(np.int64),
     ] = True
+    filled = np.asarray(seen.any(axis=1))
     points = np.where(enough[:, None], found[:, :3] + extra_cm[:, _ROWS_AT], start[:, :3])
     variance = np.diagonal(covariance, axis1=1, axis2=2)[:, _ROWS_AT]
     variance = np.where(enough[:, None], variance, np.diagonal(prior, axis1=1, axis2=2))
@@ -327,8 +331,9 @@ def _refine(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> RefinedLi
         _look(
             sign[:, None] * _sum(met[:, :, None] * edges.hues[index], 1),
             met.sum(axis=1),
-            np.asarray(seen.any(axis=1)),
+            filled,
         ),
+        _NEAR_CM + _BIN_CM * np.where(filled.any(axis=1), _last(filled), 0),
     )
 
 
@@ -369,13 +374,18 @@ def _look(
     hues: Float[np.ndarray, "m 2"], count: Int[np.ndarray, "m"], filled: Bool[np.ndarray, "m b"]
 ) -> Float[np.ndarray, "m 3"]:
     """Mean hues of lines, from their sums over the borders, and the share of gaps among their bins."""
-    first, last = filled.argmax(axis=1), filled.shape[1] - filled[:, ::-1].argmax(axis=1)
+    first, last = filled.argmax(axis=1), _last(filled)
     look = np.column_stack([hues / np.maximum(count, 1)[:, None], 1.0 - filled.sum(axis=1) / (last - first)])
     return np.where(count[:, None] > 0, look, np.nan)
+
+
+def _last(filled: Bool[np.ndarray, "m b"]) -> Int[np.ndarray, "m"]:
+    """Return the index after the last true one."""
+    return filled.shape[1] - filled[:, ::-1].argmax(axis=1)
 
 
 def _unseen(start: Float[np.ndarray, "m 4"], prior: Float[np.ndarray, "m 3 3"]) -> RefinedLines:
     sigma_cm = np.sqrt(np.diagonal(prior, axis1=1, axis2=2))
     m = len(start)
-    nothing = np.zeros(m), np.zeros((m, 3), dtype=bool), np.full((m, 3), np.nan)
+    nothing = np.zeros(m), np.zeros((m, 3), dtype=bool), np.full((m, 3), np.nan), np.full(m, _NEAR_CM)
     return RefinedLines(start[:, :3], sigma_cm, start[:, 3], *nothing)

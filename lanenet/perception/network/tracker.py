@@ -112,6 +112,9 @@ _ENDED = 0.62
 #: So far beyond a corner a line still holds. Tried: 0, 2 and 4 cm refuse 79, 56 and 40 points that are more
 #: than 2 cm off on 144 simulated drives, and 109, 90 and 76 others.
 _CORNER_CM = 2.0
+#: A line that is seen up to there has no corner within the label rows. Chosen: one bin of its borders more
+#: than a corner at the last row leaves of them.
+_GOES_ON_CM = 38.0
 #: The other line of a bend is found within this share of the width of where it is expected. Chosen.
 _BESIDE = 0.1
 _NOWHERE, _UNSEEN = [False] * len(ROWS_CM), [math.nan] * len(ROWS_CM)
@@ -148,11 +151,12 @@ class _Found(NamedTuple):
     seen_cm: float
     seen_at: list[bool]
     look: list[float]
+    seen_to_cm: float
 
     @classmethod
     def of_row(cls, row: list[float]) -> _Found:
         """Take a row of what :func:`lanenet.perception.network.refinement.refined` returns."""
-        return cls(row[:3], row[3:6], row[6], row[7], list(map(bool, row[8:11])), row[11:])
+        return cls(row[:3], row[3:6], row[6], row[7], list(map(bool, row[8:11])), row[11:14], row[14])
 
 
 class _Candidate(NamedTuple):
@@ -166,6 +170,7 @@ class _Candidate(NamedTuple):
     look: list[float]
     presence: float = 0.0
     marking_cm: float = _MARKING_CM
+    seen_to_cm: float = -math.inf
 
 
 #: Points, or sigmas, of the left and of the right line.
@@ -293,13 +298,16 @@ class LaneTracker:
         The lane's other line turns there as well; only one that is seen tells itself where.
         """
         seen = [side for side, line in enumerate(pair) if line.seen_cm >= _LINE_SEEN_CM]
+        plain = [side for side in seen if presence[side] >= SEEN]
+        if len(plain) == len(pair) and min(line.seen_to_cm for line in pair) >= _GOES_ON_CM:
+            return
         lines = [pair[side] for side in seen]
         found = corners([line.points_cm for line in lines], [line.marking_cm for line in lines], borders)
         for side, corner in zip(seen, found, strict=True):
             if corner is None:
                 continue
             ends_cm = {side: corner.ahead_cm + _CORNER_CM}
-            if 1 - side not in seen or presence[1 - side] < SEEN:
+            if 1 - side not in plain:
                 ends_cm[1 - side] = corner.of_other_cm(side, self.lane.likely_cm)
             for doubted, end_cm in ends_cm.items():
                 for i, row_cm in enumerate(ROWS_CM, start=len(ROWS_CM) * doubted):
@@ -352,9 +360,9 @@ class LaneTracker:
             score_cm = start.score_cm
             score_cm = line.seen_cm + score_cm if line.seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
             score_cm -= _BY_LOOK_CM * self.looks.unlike(start.known_as, line.look)
-            points_cm, sigma_cm, marking_cm, seen_cm, seen_at, look = line
+            points_cm, sigma_cm, marking_cm, seen_cm, seen_at, look, seen_to_cm = line
             as_seen = points_cm, sigma_cm, seen_cm, score_cm, seen_at, look
-            rated = _Candidate(*as_seen, start.presence, marking_cm)
+            rated = _Candidate(*as_seen, start.presence, marking_cm, seen_to_cm)
             candidates[start.side].append(rated)
         for side, lines in enumerate(candidates):
             doubt_cm = _BY_PRESENCE_CM * (presence[side] - 0.5)
