@@ -5,18 +5,14 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.perception.edges.compiled import if_current
+from lanenet.perception.edges.compiled import loops_of
 
-try:
-    from lanenet.perception import _kernels  # type: ignore[attr-defined]
-except ImportError:
-    _kernels = None
-else:
-    _kernels = if_current(_kernels)
+_kernels: Any = loops_of("lanenet.perception")
 
 #: Logarithms of the widths that are told apart, [cm]: 8 to 200 cm in steps of 2.5 %.
 _STEP = 0.025

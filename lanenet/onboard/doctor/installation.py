@@ -186,10 +186,15 @@ def _opencv() -> Check:
 
 
 def _kernels() -> Check:
-    if compiled.is_here() and network_compiled.is_here() and compact.is_here():
-        return Check("compiled loops", "ok", "for edges, lines and networks")
-    text = "not here: the same answers, slower; install g++ and the headers of Python, then lanenet again"
-    return Check("compiled loops", "note", text)
+    if not (compiled.is_here() and network_compiled.is_here()):
+        text = "not here: the same answers, slower; install g++ and the headers of Python, then lanenet again"
+        return Check("compiled loops", "note", text)
+    if not compact.is_here():
+        text = (
+            "for edges and lines; for networks they need a processor with AVX2: onnxruntime runs them, slower"
+        )
+        return Check("compiled loops", "note", text)
+    return Check("compiled loops", "ok", "for edges, lines and networks")
 
 
 def _onnxruntime() -> Check:

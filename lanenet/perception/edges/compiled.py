@@ -6,10 +6,11 @@ callers, in which each step is explained, do the work themselves; they also are 
 
 from __future__ import annotations
 
+import importlib
 import logging
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -20,8 +21,12 @@ from lanenet.perception.edges.pixels import EdgePixels
 log = logging.getLogger(__name__)
 
 
-def if_current(module: ModuleType) -> ModuleType | None:
-    """Return a module of compiled loops; None if its source, which lies beside it, is newer."""
+def loops_of(package: str) -> ModuleType | None:
+    """Return a package's compiled loops; None if there are none, or their source, beside them, is newer."""
+    try:
+        module = importlib.import_module(f"{package}._kernels")
+    except ImportError:
+        return None
     built = Path(str(module.__file__))
     source = built.with_name("_kernels.cpp")
     if source.exists() and source.stat().st_mtime > built.stat().st_mtime:
@@ -30,12 +35,7 @@ def if_current(module: ModuleType) -> ModuleType | None:
     return module
 
 
-try:
-    from lanenet.perception.edges import _kernels  # type: ignore[attr-defined]
-except ImportError:
-    _kernels = None
-else:
-    _kernels = if_current(_kernels)
+_kernels: Any = loops_of("lanenet.perception.edges")
 
 #: Smallest side of an image; OpenCV treats the borders of smaller ones in its own way.
 _LEAST_PX = 3

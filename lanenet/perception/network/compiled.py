@@ -5,18 +5,15 @@ As :mod:`lanenet.perception.edges.compiled`; the callers explain each step, and 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.perception.edges.compiled import if_current
+from lanenet.perception.edges.compiled import loops_of
 from lanenet.perception.edges.road import RoadEdges
 
-try:
-    from lanenet.perception.network import _kernels  # type: ignore[attr-defined]
-except ImportError:
-    _kernels = None
-else:
-    _kernels = if_current(_kernels)
+_kernels: Any = loops_of("lanenet.perception.network")
 
 #: Numbers per line that :func:`refine` returns, and :func:`corners`.
 _PER_LINE, _PER_CORNER = 15, 3

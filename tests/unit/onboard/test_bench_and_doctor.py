@@ -13,6 +13,7 @@ from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import example_camera, time_stages
 from lanenet.onboard.doctor.installation import check_camera, run_checks
 from lanenet.perception.edges import compiled
+from lanenet.perception.network.compact import network as compact
 
 
 def test_bench_reports_every_stage_with_its_ratio() -> None:
@@ -58,6 +59,10 @@ def test_it_says_whether_the_compiled_loops_are_used(monkeypatch: pytest.MonkeyP
     for kernels, state in ((object(), "ok"), (None, "note")):
         monkeypatch.setattr(compiled, "_kernels", kernels)
         assert {check.name: check.state for check in run_checks()}["compiled loops"] == state
+    monkeypatch.undo()
+    monkeypatch.setattr(compact, "is_here", lambda: False)
+    said = {check.name: check for check in run_checks()}["compiled loops"]
+    assert said.state == "note" and "AVX2" in said.text and "g++" not in said.text
 
 
 def test_good_camera_sees_the_road(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import astuple
 from types import ModuleType
 
@@ -160,16 +161,19 @@ def test_memory_beyond_the_arguments_is_not_read():
     assert np.isnan(np.frombuffer(nowhere)[:2]).all()
 
 
-def test_loops_that_are_older_than_their_source_are_not_used(tmp_path, caplog):
-    module = ModuleType("_kernels")
+def test_loops_that_are_older_than_their_source_are_not_used(tmp_path, caplog, monkeypatch):
+    module = ModuleType("lanes._kernels")
+    monkeypatch.setitem(sys.modules, "lanes._kernels", module)
+    monkeypatch.setitem(sys.modules, "lanes", ModuleType("lanes"))
+    assert compiled.loops_of("lanenet") is None
     module.__file__ = str(tmp_path / "_kernels.abi3.so")
     built, source = tmp_path / "_kernels.abi3.so", tmp_path / "_kernels.cpp"
     built.touch()
     # As in a wheel, without the source.
-    assert compiled.if_current(module) is module
+    assert compiled.loops_of("lanes") is module
     source.touch()
     os.utime(source, (1000.0, 1000.0))
-    assert compiled.if_current(module) is module and not caplog.records
+    assert compiled.loops_of("lanes") is module and not caplog.records
     os.utime(built, (999.0, 999.0))
-    assert compiled.if_current(module) is None
+    assert compiled.loops_of("lanes") is None
     assert "_kernels.cpp is newer" in caplog.text

@@ -62,12 +62,15 @@ WITHIN void take_positive(Sums& sums) {
 struct Features {
   std::vector<float> values;
   std::vector<std::uint8_t> plain;
-  int rows, columns, channels;
+  int rows = 0, columns = 0, channels = 0;
 
+  // Every place is written in each frame, and the border never: it stays as it was made.
   void reset(int new_rows, int new_columns, int new_channels) {
+    if (rows == new_rows && columns == new_columns && channels == new_channels) return;
+    rows = columns = channels = 0;  // also if there is no memory
+    values.assign(static_cast<size_t>(new_rows + 2) * (new_columns + 2) * new_channels, 0.0f);
+    plain.assign(static_cast<size_t>(new_rows + 2) * (new_columns + 2), 0);
     rows = new_rows, columns = new_columns, channels = new_channels;
-    values.assign(static_cast<size_t>(rows + 2) * row_length(), 0.0f);
-    plain.assign(static_cast<size_t>(rows + 2) * (columns + 2), 0);
   }
   int row_length() const { return (columns + 2) * channels; }
   float* at(int row, int column) { return values.data() + (row + 1) * row_length() + (column + 1) * channels; }
@@ -152,7 +155,7 @@ FAST void convolve(Features& in, const float* weights, const float* bias, Featur
   static std::vector<int> places, plain;  // kept from frame to frame
   list_places(in, out, places, plain);
   const int last = static_cast<int>(places.size()) - 1, count = 3 * in.channels;
-  const auto in_out = [&](int place) { return out.at(place / out.columns, place % out.columns); };
+  const auto place_of = [&](int place) { return out.at(place / out.columns, place % out.columns); };
   for (int f = 0; f < out.channels; f += kLanes, weights += 3 * count * kLanes)
     for (int begin = 0; begin <= last; begin += kSpots) {
       const float* from[kSpots];
@@ -160,7 +163,7 @@ FAST void convolve(Features& in, const float* weights, const float* bias, Featur
       Sums sums[kSpots];
       for (int s = 0; s < kSpots; ++s) {
         const int place = places[std::min(begin + s, last)];
-        from[s] = in.at(2 * (place / out.columns) - 1, 2 * (place % out.columns) - 1), to[s] = in_out(place) + f;
+        from[s] = in.at(2 * (place / out.columns) - 1, 2 * (place % out.columns) - 1), to[s] = place_of(place) + f;
         read(bias + f, sums[s]);
       }
       const float* w = weights;
@@ -171,7 +174,7 @@ FAST void convolve(Features& in, const float* weights, const float* bias, Featur
       }
       for (int s = 0; s < kSpots; ++s) take_positive(sums[s]), write(sums[s], to[s]);
     }
-  for (size_t i = 1; i < plain.size(); ++i) std::copy_n(in_out(plain[0]), out.channels, in_out(plain[i]));
+  for (size_t i = 1; i < plain.size(); ++i) std::copy_n(place_of(plain[0]), out.channels, place_of(plain[i]));
 }
 
 // A fully connected layer of all that a map holds.
@@ -284,7 +287,7 @@ PyObject* run(PyObject*, PyObject* args) {
   l.weights = weights.as<float>();
   try {
     // Kept from frame to frame; one caller at a time: the interpreter's lock is held.
-    static Features maps[2];
+    static Features maps[kMostLayers], units;  // of each layer its own: they differ in size
     static std::vector<float> told, out;
     told.assign(biases.as<float>(), biases.as<float>() + biases.size<float>());
     if (width_cm > 0.0) tell_width(width_cm, width_sigma, log_widths, by_width.as<float>(), told);
@@ -293,14 +296,13 @@ PyObject* run(PyObject*, PyObject* args) {
     convolve_raster(l, maps[0]);
     const float *w = l.weights + n_first, *b = l.bias + sizes[0];
     for (int i = 1; i < layers; w += 9 * sizes[i - 1] * sizes[i], b += sizes[i], ++i) {
-      Features &before = maps[(i - 1) % 2], &after = maps[i % 2];
+      Features &before = maps[i - 1], &after = maps[i];
       after.reset((before.rows + 1) / 2, (before.columns + 1) / 2, sizes[i]);
       convolve(before, w, b, after);
     }
-    Features& units = maps[layers % 2];
     units.reset(1, 1, hidden);
     float* unit = units.at(0, 0);
-    connect(maps[(layers - 1) % 2], w, b, hidden, unit);
+    connect(maps[layers - 1], w, b, hidden, unit);
     for (int i = 0; i < hidden; ++i) unit[i] = std::max(unit[i], 0.0f);
     out.resize(outputs);
     connect(units, w + n_hidden, b + hidden, outputs, out.data());

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from lanenet.geometry.lane import N_POINTS, SIDES
-from lanenet.perception.edges.compiled import if_current
+from lanenet.perception.edges.compiled import loops_of
 from lanenet.perception.edges.raster import MIDDLE, STEPS
 from lanenet.perception.network.compact.onnx_reading import Graph, read_graph
 from lanenet.perception.network.model_file import (
@@ -33,12 +33,7 @@ from lanenet.perception.network.model_file import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-try:
-    from lanenet.perception.network.compact import _kernels  # type: ignore[attr-defined]
-except ImportError:
-    _kernels = None
-else:
-    _kernels = if_current(_kernels)
+_kernels: Any = loops_of("lanenet.perception.network.compact")
 
 log = logging.getLogger(__name__)
 
