@@ -31,6 +31,13 @@ _TURNED = 2.0
 _BEFORE_CM, _REACH = 3.0, 1.5
 #: Distance of the points of a followed line, and how far behind the front axle it goes on straight. Chosen.
 _APART_CM, _BEHIND_CM = 2.0, 30.0
+#: Share of a frame in the width that both lines show; and deviation from the lane's width, as a share of it,
+#: from which it counts. Chosen: bends and worn tape give less.
+_GAIN, _DEVIATION = 0.3, 0.1
+#: Sigma of that width once one line only is seen, as a share of the deviation: at first, and per frame. So
+#: many frames it is known. On 168 simulated drives of seven seeds the RMSE is 1.28 instead of 1.39 cm for it,
+#: and 0.3 % fewer points are answered. Tried: 0.05 per frame, and deviations from 0.06 on, gave the same.
+_AT_FIRST, _PER_FRAME, _KNOWN_FRAMES = 0.1, 0.1, 60
 _FAR_CM = ROWS_CM[-1]
 _ROWS, _ALONG_CM = np.array(ROWS_CM), np.arange(-_BEHIND_CM, _FAR_CM + 1e-9, _APART_CM)
 
@@ -54,6 +61,40 @@ class SeenLine(NamedTuple):
     def inwards(self) -> float:
         """Which way its lane lies: 1 to the right, -1 to the left."""
         return 1.0 if self.side == 0 else -1.0
+
+
+class WidthHere:
+    """How wide a lane was where both of its lines were last seen: some widen, and not where nobody looks."""
+
+    def __init__(self) -> None:
+        """Know of nothing but the lane's usual width."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what earlier frames showed."""
+        self._width_cm, self._frames = math.nan, 0
+
+    def look(self, across_cm: float | None) -> None:
+        """Take a frame.
+
+        Args:
+            across_cm: The distance of the two lines, if both are seen.
+        """
+        if across_cm is None:
+            self._frames += 1
+            if self._frames > _KNOWN_FRAMES:
+                self.reset()
+            return
+        before_cm = across_cm if math.isnan(self._width_cm) else self._width_cm
+        self._width_cm, self._frames = before_cm + _GAIN * (across_cm - before_cm), 0
+
+    def instead_of(self, width_cm: float) -> tuple[float, float]:
+        """Return the lane's width here and its sigma, [cm]: the usual one, and 0, unless they differ."""
+        off_cm = self._width_cm - width_cm
+        # Not a number where nothing was seen.
+        if not abs(off_cm) > _DEVIATION * width_cm:
+            return width_cm, 0.0
+        return self._width_cm, abs(off_cm) * (_AT_FIRST + _PER_FRAME * self._frames)
 
 
 def line_beside(line: SeenLine, width_cm: float, edges: RoadEdges) -> Float[np.ndarray, "3"]:

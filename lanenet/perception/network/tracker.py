@@ -22,7 +22,7 @@ from lanenet.perception.network import compiled
 from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.corner import corners
 from lanenet.perception.network.lane_belief import Keep, LineLooks
-from lanenet.perception.network.line_beside import SeenLine, line_beside
+from lanenet.perception.network.line_beside import SeenLine, WidthHere, line_beside
 from lanenet.perception.network.refinement import BASIS, RoadBorders, line_at, refined
 from lanenet.perception.network.straight_on import SeenLines, StraightOn
 from lanenet.perception.rolling_median import RollingMedian
@@ -194,6 +194,7 @@ class LaneTracker:
         self.straight_on = StraightOn()
         self._view = view
         self._markings_cm = [RollingMedian(_LENGTH), RollingMedian(_LENGTH)]
+        self._width_here = WidthHere()
         self._frames = 0
 
     def reset(self) -> None:
@@ -201,6 +202,7 @@ class LaneTracker:
         self._last, self._rival, self._entered, self._frames = None, None, False, 0
         self.straight_on.reset()
         self.looks.reset()
+        self._width_here.reset()
         for widths_cm in self._markings_cm:
             widths_cm.clear()
 
@@ -231,12 +233,13 @@ class LaneTracker:
         # In one go, since each look at the edge points has a price.
         found = self._refine([*starts, *measured], borders)
         looked_for, measures = found[: len(starts)], found[len(starts) :]
-        pair, decided = self._best_pair(self._candidates(starts, looked_for, own, present))
+        pair, across_cm, decided = self._best_pair(self._candidates(starts, looked_for, own, present))
         if self._at_junction(pair, present, borders):
             continued_cm, continued_sigma_cm = (x.ravel().tolist() for x in self.straight_on.lane())
             self._last = _both(continued_cm), _both(continued_sigma_cm)
             return (*self._known(continued_cm, continued_sigma_cm, continued_cm), np.zeros(len(SIDES)))
         self._notice_change(pair)
+        self._width_here.look(across_cm if decided and _is_plain(pair) else None)
         self._learn_markings(pair, zip(measured, measures, strict=True))
         for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
@@ -279,12 +282,14 @@ class LaneTracker:
         marking_cm = self._usual_marking_cm(side) or _MARKING_CM
         seen = SeenLine(side, np.array(line.points_cm), line.seen_at[-1], marking_cm)
         own, other = len(ROWS_CM) * side, len(ROWS_CM) * (1 - side)
+        usual_sigma_cm = self.lane.width_sigma * width_cm
+        width_cm, sigma_cm = self._width_here.instead_of(width_cm)
         for i, told_cm in enumerate(line_beside(seen, width_cm, edges).tolist()):
             if math.isnan(told_cm):
                 found_sigma_cm[other + i] = math.inf
                 continue
             found_cm[other + i] = told_cm
-            found_sigma_cm[other + i] = math.hypot(found_sigma_cm[own + i], self.lane.width_sigma * width_cm)
+            found_sigma_cm[other + i] = math.hypot(found_sigma_cm[own + i], usual_sigma_cm, sigma_cm)
 
     def _doubt_beyond_corners(
         self,
@@ -488,6 +493,7 @@ class LaneTracker:
             was_cm, crossed_cm = before_cm[1 - side], before_cm[side]
             if abs(now_cm - was_cm) > _CHANGED * width_cm and abs(now_cm - crossed_cm) < _SAME * width_cm:
                 self._entered = True
+                self._width_here.reset()
                 self.looks.cross(side)
                 self._markings_cm[1 - side] = self._markings_cm[side]
                 self._markings_cm[side] = RollingMedian(_LENGTH)
@@ -548,11 +554,11 @@ class LaneTracker:
 
     def _best_pair(
         self, candidates: tuple[list[_Candidate], list[_Candidate]]
-    ) -> tuple[tuple[_Candidate, _Candidate], bool]:
+    ) -> tuple[tuple[_Candidate, _Candidate], float, bool]:
         """Choose the left and the right line, and learn the width from what would be chosen without.
 
         Returns:
-            The pair, and whether clearly less speaks for each pair in the next lane.
+            The pair, its lines' distance, [cm], and whether clearly less speaks for those in the next lane.
         """
         lines_cm = np.array([line.points_cm for lines in candidates for line in lines])
         lefts = len(candidates[0])
@@ -573,13 +579,12 @@ class LaneTracker:
                 widths.append(width_cm)
         self._rival = None
         if not pairs:
-            return (candidates[0][-1], candidates[1][-1]), True
+            return (candidates[0][-1], candidates[1][-1]), math.nan, True
         likely = self.lane.match(np.array(widths), _WIDTH_SIGMA).tolist()
         best = scores.index(max(scores))
         shown = pairs[best]
         # A belief must not choose its own evidence: else a wrong one would never be unlearned.
-        plain = all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SEEN for line in shown)
-        if outsides[best] <= 0.0 and plain:
+        if outsides[best] <= 0.0 and _is_plain(shown):
             self.lane.learn(np.array(shown[0].points_cm + shown[1].points_cm), _CERTAIN)
         scores = [score - _BY_WIDTH_CM * (1.0 - own) for score, own in zip(scores, likely, strict=True)]
         if self._on_line():
@@ -594,11 +599,16 @@ class LaneTracker:
             if score >= least and abs(_middle_cm(pairs[i]) - middle_cm) > next_cm
         ]
         self._rival = pairs[max(rivals, key=scores.__getitem__)] if rivals else None
-        return pairs[chosen], not rivals
+        return pairs[chosen], widths[chosen], not rivals
 
 
 def _both(values: list[float]) -> _Both:
     return [values[: len(ROWS_CM)], values[len(ROWS_CM) :]]
+
+
+def _is_plain(pair: tuple[_Candidate, _Candidate]) -> bool:
+    """Return whether both lines tell the lane's width."""
+    return all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SEEN for line in pair)
 
 
 def _middle_cm(pair: tuple[_Candidate, _Candidate]) -> float:

@@ -110,6 +110,19 @@ def test_one_line_that_is_seen_tells_where_the_other_one_is():
     assert seen_cm[1] == 0.0 and 2.0 < sigma_cm[3:].max() < 3.0
 
 
+def test_the_line_beside_a_lane_that_has_widened_is_not_told_by_its_usual_width():
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for wider_cm in np.arange(0.0, 16.0):
+        wide = np.repeat([-20.0, 20.0 + wider_cm], 3)
+        tracker.follow(wide, SURE, SEEN, edges_of(wide))
+    # The right line is out of view, and the network takes the lane for one of the usual width.
+    usual = np.repeat([-20.0, 20.0], 3)
+    shown = edges_of(wide, sides=(0,))
+    points_cm, _, _ = tracker.follow(usual, SURE, np.array([1.0, 0.0]), shown)
+    np.testing.assert_allclose(points_cm[:3], -20.0, atol=0.2)
+    assert np.isnan(points_cm[3:]).all()
+
+
 def sigma_15_cm_ahead(off_cm: float) -> float:
     """That of the left line, where the network's own answer lies so far beside it."""
     straight = np.array([-20.0] * 3 + [20.0] * 3)

@@ -7,7 +7,7 @@ import pytest
 from tapes import tape, turned
 
 from lanenet.perception.edges.road import RoadEdges
-from lanenet.perception.network.line_beside import SeenLine, line_beside
+from lanenet.perception.network.line_beside import SeenLine, WidthHere, line_beside
 
 LANE_CM = 40.0
 
@@ -58,3 +58,28 @@ def test_what_the_end_of_the_line_would_tell_is_not_told():
     assert np.isnan(told_cm[2])
     nothing = RoadEdges(np.zeros((0, 2)), np.zeros((0, 2)))
     assert np.isnan(line_beside(line._replace(far=True), LANE_CM, nothing)[2])
+
+
+def test_where_a_lane_has_widened_its_usual_width_tells_nothing():
+    here = WidthHere()
+    assert here.instead_of(LANE_CM) == (LANE_CM, 0.0)
+    for across_cm in np.linspace(LANE_CM, 1.4 * LANE_CM, 30):
+        here.look(float(across_cm))
+    width_cm, sigma_cm = here.instead_of(LANE_CM)
+    assert 1.3 * LANE_CM < width_cm < 1.4 * LANE_CM and 0.0 < sigma_cm < 0.1 * LANE_CM
+    # Where nobody looks it may go on widening, or end.
+    sigmas_cm = []
+    for _ in range(10):
+        here.look(None)
+        sigmas_cm.append(here.instead_of(LANE_CM)[1])
+    assert sigmas_cm == sorted(sigmas_cm) and sigmas_cm[-1] > 0.25 * LANE_CM
+    for _ in range(60):
+        here.look(None)
+    assert here.instead_of(LANE_CM) == (LANE_CM, 0.0)
+
+
+def test_a_lane_that_is_nearly_as_wide_as_ever_has_its_usual_width():
+    here = WidthHere()
+    for across_cm in (38.0, 41.0, 43.0):
+        here.look(across_cm)
+    assert here.instead_of(LANE_CM) == (LANE_CM, 0.0)
