@@ -186,13 +186,11 @@ def _opencv() -> Check:
 
 
 def _kernels() -> Check:
-    if not (compiled.is_here() and network_compiled.is_here()):
+    if not (compiled.is_here() and network_compiled.is_here() and compact.is_installed()):
         text = "not here: the same answers, slower; install g++ and the headers of Python, then lanenet again"
         return Check("compiled loops", "note", text)
     if not compact.is_here():
-        text = (
-            "for edges and lines; for networks they need a processor with AVX2: onnxruntime runs them, slower"
-        )
+        text = "for edges and lines; for networks only with AVX2 and FMA: onnxruntime runs them, slower"
         return Check("compiled loops", "note", text)
     return Check("compiled loops", "ok", "for edges, lines and networks")
 

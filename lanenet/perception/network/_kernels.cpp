@@ -1,4 +1,5 @@
-// Lines on the edge points of their markings, and the distances of lines: refinement.py and tracker.py, compiled.
+// Lines on the edge points of their markings, their corners and distances: refinement.py, corner.py and tracker.py,
+// compiled.
 // What a step means and where its numbers come from stands there. Every sum is taken in the order of the Python
 // code, in double precision, so that the bytes are equal (build with -ffp-contract=off). Arrays come as contiguous
 // buffers, whose types compiled.py sees to.
@@ -552,20 +553,21 @@ bool take_middles(const CornerNumbers& s, const double* line, const T* points, c
 
 void sort_into_cells(const CornerNumbers& s, Middles& e) {
   const int n = e.count;
+  const double cell_cm = 1.001 * s.next_cm;  // more than tape may have as a gap, whatever is rounded
   double first_x = e.found[0].x, last_x = first_x;
   for (int i = 1; i < n; ++i) first_x = std::min(first_x, e.found[i].x), last_x = std::max(last_x, e.found[i].x);
   const auto column_of = [&](double x) {
-    return static_cast<int>(std::min((x - first_x) / s.next_cm, kMostColumns)) + 1;
+    return static_cast<int>(std::min((x - first_x) / cell_cm, kMostColumns)) + 1;
   };
   // One more around all of them, so that each cell has its neighbours.
   e.columns = column_of(last_x) + 2;
-  const int rows = static_cast<int>((s.far_cm - s.near_cm) / s.next_cm) + 3;
+  const int rows = static_cast<int>((s.far_cm - s.near_cm) / cell_cm) + 3;
   for (auto* values : {&e.x, &e.y, &e.normal_x, &e.normal_y}) values->resize(n);
   for (auto* flags : {&e.reached, &e.of_tape}) flags->resize(n);
   e.own.resize(n), e.cell.resize(n), e.place.resize(n);
   e.begin.assign(e.columns * rows + 1, 0);
   const auto cell_of = [&](const Middle& point) {
-    return (static_cast<int>((point.y - s.near_cm) / s.next_cm) + 1) * e.columns + column_of(point.x);
+    return (static_cast<int>((point.y - s.near_cm) / cell_cm) + 1) * e.columns + column_of(point.x);
   };
   for (int i = 0; i < n; ++i) ++e.begin[e.place[i] = cell_of(e.found[i])];
   int before = 0;
@@ -637,7 +639,7 @@ void find_corner(const CornerNumbers& s, Middles& e, double* out) {
     }
   }
   int count = 0;
-  double off = 0.0, along = 0.0;
+  double off = 0.0, along = 0.0, far = 0.0;
   Middle least = e.found[0], most = e.found[0];
   for (int i = 0; i < n; ++i) {
     const Middle& point = e.found[i];
@@ -647,6 +649,7 @@ void find_corner(const CornerNumbers& s, Middles& e, double* out) {
     least.y = std::min(least.y, point.y), most.y = std::max(most.y, point.y);
     off += point.off;
     along += point.along;
+    far += point.y;
     ++count;
     e.stack.push_back(e.place[i]);
   }
@@ -667,7 +670,8 @@ void find_corner(const CornerNumbers& s, Middles& e, double* out) {
   if (beyond >= s.goes_on) return;
   out[0] = ahead;
   out[1] = off / count;
-  out[2] = along / count;
+  // Tape that runs back has turned by more than a right angle.
+  out[2] = far / count < ahead ? -along / count : along / count;
 }
 
 // --- Python ---
@@ -711,11 +715,11 @@ PyObject* refine(PyObject*, PyObject* args) {
     for (const double bin : s.beside[i]) sound &= within(bin, kMostBins);
   }
   if (!sound) return refuse("numbers: not those that this was compiled for");
+  PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * kPerLine * sizeof(double));
+  if (!result) return nullptr;
   try {
     static Near near;  // one caller at a time: the interpreter's lock is held
     static Beside beside;
-    PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * kPerLine * sizeof(double));
-    if (!result) return nullptr;
     double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
     const auto take = [&](auto type) {
       using T = decltype(type);
@@ -735,6 +739,7 @@ PyObject* refine(PyObject*, PyObject* args) {
     }
     return result;
   } catch (const std::exception&) {
+    Py_DECREF(result);
     return PyErr_NoMemory();
   }
 }
@@ -751,10 +756,12 @@ PyObject* corners(PyObject*, PyObject* args) {
   if (numbers.view.len != sizeof(CornerNumbers)) return refuse("numbers: not of this size");
   CornerNumbers s;
   std::memcpy(&s, numbers.view.buf, sizeof s);
+  if (!(s.next_cm > 0.0 && s.meet_cm <= s.next_cm && (s.far_cm - s.near_cm) / s.next_cm < kMostColumns))
+    return refuse("numbers: not those that this was compiled for");
+  PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * kPerCorner * sizeof(double));
+  if (!result) return nullptr;
   try {
     static Middles middles;  // one caller at a time: the interpreter's lock is held
-    PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * kPerCorner * sizeof(double));
-    if (!result) return nullptr;
     double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
     std::fill_n(out, m * kPerCorner, kNaN);
     const size_t n = edges.view.len / pair;
@@ -766,6 +773,7 @@ PyObject* corners(PyObject*, PyObject* args) {
     }
     return result;
   } catch (const std::exception&) {
+    Py_DECREF(result);
     return PyErr_NoMemory();
   }
 }

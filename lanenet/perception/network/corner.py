@@ -53,13 +53,17 @@ _NUMBERS = np.concatenate(
 )
 
 
+#: Points that are compared with all others at a time, without compiled loops.
+_AT_A_TIME = 128
+
+
 class Corner(NamedTuple):
     """Where the tape of a line turns off it.
 
     Attributes:
         ahead_cm: y of the corner, frame car.
         aside_cm: How far the tape gets beside the line on average, positive to the right.
-        cosine: Of the angle by which it turns.
+        cosine: Of the angle by which it turns, from 0 to less than 180 degrees.
     """
 
     ahead_cm: float
@@ -119,11 +123,8 @@ def _corner(line: Float[np.ndarray, "4"], borders: RoadBorders) -> list[float]:
     aside = (np.abs(off_cm) > _ASIDE_CM) & (along < _ASIDE_COSINE)
     if own.sum() < _LEAST or aside.sum() < _LEAST:
         return nowhere
-    apart_x, apart_y = x - x[:, None], y - y[:, None]
-    apart2 = apart_x * apart_x + apart_y * apart_y
-    opposite = normal_x * normal_x[:, None] + normal_y * normal_y[:, None] < _OPPOSITE
-    of_tape = (opposite & (apart2 < _MEET_CM * _MEET_CM)).any(axis=1)
-    next_to, tape_beside = apart2 < _NEXT_CM * _NEXT_CM, of_tape & ~own
+    of_tape, next_to = _neighbours(x, y, normal_x, normal_y)
+    tape_beside = of_tape & ~own
     start = tape_beside & (np.abs(off_cm) < _OWN_CM + _NEXT_CM) & next_to[own].any(axis=0)
     turned = aside & _connected(start, tape_beside, next_to)
     if turned.sum() < _LEAST:
@@ -131,12 +132,34 @@ def _corner(line: Float[np.ndarray, "4"], borders: RoadBorders) -> list[float]:
     span_x, span_y = np.ptp(x[turned]), np.ptp(y[turned])
     if span_x * span_x + span_y * span_y < _SPAN_CM * _SPAN_CM:
         return nowhere
-    nearest = np.unravel_index(apart2[np.ix_(own, turned)].argmin(), (own.sum(), turned.sum()))[0]
+    apart_x, apart_y = x[turned] - x[own, None], y[turned] - y[own, None]
+    nearest = (apart_x * apart_x + apart_y * apart_y).min(axis=1).argmin()
     ahead_cm = y[own][nearest]
     if (own & of_tape & (y > ahead_cm + _BEYOND_CM)).sum() >= _GOES_ON:
         return nowhere
-    count = int(turned.sum())
-    return [float(ahead_cm), sum(off_cm[turned].tolist()) / count, sum(along[turned].tolist()) / count]
+    aside_cm, cosine, far_cm = (sum(v[turned].tolist()) / int(turned.sum()) for v in (off_cm, along, y))
+    # Tape that runs back has turned by more than a right angle.
+    return [float(ahead_cm), aside_cm, -cosine if far_cm < ahead_cm else cosine]
+
+
+def _neighbours(
+    x: Float[np.ndarray, "n"],
+    y: Float[np.ndarray, "n"],
+    normal_x: Float[np.ndarray, "n"],
+    normal_y: Float[np.ndarray, "n"],
+) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n n"]]:
+    """Return which points have the other border of their tape where they are, and which are next to which."""
+    n = len(x)
+    of_tape, next_to = np.zeros(n, dtype=bool), np.zeros((n, n), dtype=bool)
+    # Some points at a time: all pairs of a crowded frame would take hundreds of megabytes.
+    for begin in range(0, n, _AT_A_TIME):
+        some = slice(begin, begin + _AT_A_TIME)
+        apart_x, apart_y = x - x[some, None], y - y[some, None]
+        apart2 = apart_x * apart_x + apart_y * apart_y
+        opposite = normal_x * normal_x[some, None] + normal_y * normal_y[some, None] < _OPPOSITE
+        of_tape[some] = (opposite & (apart2 < _MEET_CM * _MEET_CM)).any(axis=1)
+        next_to[some] = apart2 < _NEXT_CM * _NEXT_CM
+    return of_tape, next_to
 
 
 def _connected(

@@ -237,6 +237,7 @@ class LaneTracker:
         if self._at_junction(pair, present, borders):
             continued_cm, continued_sigma_cm = (x.ravel().tolist() for x in self.straight_on.lane())
             self._last = _both(continued_cm), _both(continued_sigma_cm)
+            self._width_here.look(None)
             return (*self._known(continued_cm, continued_sigma_cm, continued_cm), np.zeros(len(SIDES)))
         self._notice_change(pair)
         self._width_here.look(across_cm if decided and _is_plain(pair) else None)
@@ -313,7 +314,8 @@ class LaneTracker:
                 continue
             ends_cm = {side: corner.ahead_cm + _CORNER_CM}
             if 1 - side not in plain:
-                ends_cm[1 - side] = corner.of_other_cm(side, self.lane.likely_cm)
+                width_cm, _ = self._width_here.instead_of(self.lane.likely_cm)
+                ends_cm[1 - side] = corner.of_other_cm(side, width_cm)
             for doubted, end_cm in ends_cm.items():
                 for i, row_cm in enumerate(ROWS_CM, start=len(ROWS_CM) * doubted):
                     if row_cm > end_cm:
@@ -564,7 +566,7 @@ class LaneTracker:
         lefts = len(candidates[0])
         across_cm = distances_cm(lines_cm[:lefts], lines_cm[lefts:]).tolist()
         least_cm = _NARROWEST * self.lane.likely_cm
-        pairs, scores, outsides, widths = [], [], [], []
+        pairs, scores, widths = [], [], []
         for left, row in zip(candidates[0], across_cm, strict=True):
             for right, width_cm in zip(candidates[1], row, strict=True):
                 if width_cm < least_cm:
@@ -575,7 +577,6 @@ class LaneTracker:
                     score_cm -= _BY_OUTSIDE_CM * min(outside_cm / _OUTSIDE_CM, 1.0)
                 pairs.append((left, right))
                 scores.append(score_cm)
-                outsides.append(outside_cm)
                 widths.append(width_cm)
         self._rival = None
         if not pairs:
@@ -584,7 +585,7 @@ class LaneTracker:
         best = scores.index(max(scores))
         shown = pairs[best]
         # A belief must not choose its own evidence: else a wrong one would never be unlearned.
-        if outsides[best] <= 0.0 and _is_plain(shown):
+        if _is_plain(shown):
             self.lane.learn(np.array(shown[0].points_cm + shown[1].points_cm), _CERTAIN)
         scores = [score - _BY_WIDTH_CM * (1.0 - own) for score, own in zip(scores, likely, strict=True)]
         if self._on_line():
@@ -607,8 +608,10 @@ def _both(values: list[float]) -> _Both:
 
 
 def _is_plain(pair: tuple[_Candidate, _Candidate]) -> bool:
-    """Return whether both lines tell the lane's width."""
-    return all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SEEN for line in pair)
+    """Return whether both lines tell the lane's width: they are seen, and the car is between them."""
+    left, right = pair
+    between = left.points_cm[0] <= 0.0 <= right.points_cm[0]
+    return between and all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SEEN for line in pair)
 
 
 def _middle_cm(pair: tuple[_Candidate, _Candidate]) -> float:

@@ -9,6 +9,8 @@ import pytest
 from tapes import tape, turned
 
 from lanenet.perception.edges.road import RoadEdges
+from lanenet.perception.network import compiled
+from lanenet.perception.network import corner as corner_module
 from lanenet.perception.network.corner import Corner, corners
 from lanenet.perception.network.refinement import RoadBorders
 
@@ -25,7 +27,7 @@ def both(*edges: RoadEdges) -> RoadEdges:
     return RoadEdges(np.concatenate(points), np.concatenate(normals))
 
 
-@pytest.mark.parametrize("turn_deg", [40.0, 70.0, 90.0, 110.0])
+@pytest.mark.parametrize("turn_deg", [40.0, 70.0, 85.0, 110.0])
 @pytest.mark.parametrize("marking_cm", [2.0, 4.0, -3.0])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_tape_that_turns_ends_its_line(turn_deg, marking_cm, mirrored):
@@ -35,7 +37,7 @@ def test_tape_that_turns_ends_its_line(turn_deg, marking_cm, mirrored):
     assert corner is not None
     assert corner.ahead_cm == pytest.approx(22.0, abs=1.5)
     assert corner.aside_cm * sign > 0.0
-    assert corner.cosine == pytest.approx(abs(math.cos(math.radians(turn_deg))), abs=0.02)
+    assert corner.cosine == pytest.approx(math.cos(math.radians(turn_deg)), abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +72,8 @@ def test_the_rim_of_a_reflection_is_no_tape():
     line = tape(np.array([[-20.0, 0.0], [-20.0, 22.0]]), 3.0)
     angle = np.linspace(0.0, 2.0 * np.pi, 80)
     out = np.column_stack([np.cos(angle), np.sin(angle)])
-    rim = RoadEdges(out * 9.0 + (-14.0, 29.0), -out)
+    # It begins where the line ends, and goes on aside.
+    rim = RoadEdges(out * 9.0 + (-11.0, 28.0), -out)
     assert corner_of(both(line, rim)) is None
 
 
@@ -79,8 +82,26 @@ def test_the_inner_line_of_a_corner_turns_before_the_outer_one():
     # A left line that turns to the right is the outer one, and a right line the inner one.
     assert right_angle.of_other_cm(0, 40.0) == pytest.approx(25.0 - 40.0)
     assert right_angle.of_other_cm(1, 40.0) == pytest.approx(25.0 + 40.0)
+    sharp = Corner(25.0, 10.0, math.cos(math.radians(120.0)))
+    assert sharp.of_other_cm(0, 40.0) == pytest.approx(25.0 - 40.0 * math.tan(math.radians(60.0)))
     half = Corner(25.0, -10.0, math.cos(math.radians(45.0)))
     assert half.of_other_cm(1, 40.0) == pytest.approx(25.0 - 40.0 * math.tan(math.radians(22.5)))
+
+
+def test_tape_that_only_ends_beside_the_line_is_no_corner():
+    """Six edge points are not enough, nor is a spot of tape."""
+    line = tape(np.array([[-20.0, 0.0], [-20.0, 22.0]]), 3.0)
+    spot = tape(np.array([[-18.0, 23.0], [-15.0, 24.0]]), 3.0)
+    assert corner_of(both(line, spot)) is None
+    assert corner_of(both(line, tape(np.array([[-18.0, 23.0], [-6.0, 27.0]]), 3.0))) is not None
+
+
+def test_a_crowded_frame_is_looked_at_in_parts(monkeypatch):
+    edges = tape(turned(70.0, 22.0), 3.0)
+    found = corner_of(edges)
+    monkeypatch.setattr(compiled, "_kernels", None)
+    monkeypatch.setattr(corner_module, "_AT_A_TIME", 7)
+    assert corner_of(edges) == found
 
 
 def test_without_edges_or_lines_there_are_none():

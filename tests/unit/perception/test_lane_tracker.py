@@ -12,6 +12,7 @@ from lanenet.geometry.lane import parabolas_from_points
 from lanenet.onboard.bench import example_camera
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
+from lanenet.perception.network import tracker as tracker_module
 from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.refinement import RoadBorders, refine_lines
 from lanenet.perception.network.tracker import LaneTracker, distances_cm
@@ -110,17 +111,19 @@ def test_one_line_that_is_seen_tells_where_the_other_one_is():
     assert seen_cm[1] == 0.0 and 2.0 < sigma_cm[3:].max() < 3.0
 
 
-def test_the_line_beside_a_lane_that_has_widened_is_not_told_by_its_usual_width():
+@pytest.mark.parametrize("forgotten", [False, True])
+def test_the_line_beside_a_lane_that_has_widened_is_not_told_by_its_usual_width(forgotten):
     tracker = LaneTracker(LaneMemory(LANE_CM))
     for wider_cm in np.arange(0.0, 16.0):
         wide = np.repeat([-20.0, 20.0 + wider_cm], 3)
         tracker.follow(wide, SURE, SEEN, edges_of(wide))
+    if forgotten:
+        tracker.reset()
     # The right line is out of view, and the network takes the lane for one of the usual width.
     usual = np.repeat([-20.0, 20.0], 3)
-    shown = edges_of(wide, sides=(0,))
-    points_cm, _, _ = tracker.follow(usual, SURE, np.array([1.0, 0.0]), shown)
+    points_cm, _, _ = tracker.follow(usual, SURE, np.array([1.0, 0.0]), edges_of(usual, sides=(0,)))
     np.testing.assert_allclose(points_cm[:3], -20.0, atol=0.2)
-    assert np.isnan(points_cm[3:]).all()
+    assert np.isfinite(points_cm[3:]).tolist() == [forgotten] * 3
 
 
 def sigma_15_cm_ahead(off_cm: float) -> float:
@@ -310,16 +313,45 @@ def test_nothing_is_answered_beyond_a_corner_of_the_tape(other_seen):
     tracker = LaneTracker(LaneMemory(LANE_CM))
     for _ in range(12):
         tracker.follow(lane, SURE, SEEN, edges_of(lane))
-    # The left line turns to the right 22 cm ahead; the network has both straight on.
-    shown = tape(turned(75.0, 22.0), 3.0)
+    # The left line turns to the right 12 cm ahead; the network has both straight on.
+    shown = tape(turned(75.0, 12.0), 3.0)
     if other_seen:
         right = edges_of(lane, sides=(1,))
         shown = RoadEdges(
             np.concatenate([shown.points_cm, right.points_cm]), np.concatenate([shown.normals, right.normals])
         )
     points_cm, _, _ = tracker.follow(lane, SURE, np.array([1.0, float(other_seen)]), shown)
-    known = [True, True, False, True, True, True] if other_seen else [True, True, False, False, False, False]
-    assert np.isfinite(points_cm).tolist() == known
+    assert np.isfinite(points_cm).tolist() == [True, False, False, *[other_seen] * 3]
+
+
+def test_where_both_lines_go_on_no_corner_is_looked_for(monkeypatch):
+    lane = np.repeat([-20.0, 20.0], 3)
+    looked_for = []
+    monkeypatch.setattr(
+        tracker_module, "corners", lambda lines, *_: looked_for.append(len(lines)) or [None] * len(lines)
+    )
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    edges = edges_of(lane)
+    tracker.follow(lane, SURE, SEEN, edges)
+    assert not looked_for
+    ends = edges.points_cm[:, 1] < np.where(edges.points_cm[:, 0] < 0.0, 30.0, 50.0)
+    tracker.follow(lane, SURE, SEEN, RoadEdges(edges.points_cm[ends], edges.normals[ends]))
+    tracker.follow(lane, SURE, np.array([1.0, 0.0]), edges)
+    assert looked_for == [2, 2]
+
+
+def test_a_line_says_how_far_it_is_seen():
+    edges = edges_of(BENT)
+    near = edges.points_cm[:, 1] < 21.0
+    asked = BENT.reshape(2, 3), np.full((2, 3), 2.0)
+    markings = np.full(2, 3.0), np.full(2, 2.0)
+    ended = refine_lines(
+        *asked, RoadBorders(RoadEdges(edges.points_cm[near], edges.normals[near])), *markings
+    )
+    assert ((ended.seen_to_cm >= 20.0) & (ended.seen_to_cm <= 24.0)).all()
+    nothing = refine_lines(*asked, RoadBorders(RoadEdges(np.zeros((0, 2)), np.zeros((0, 2)))), *markings)
+    assert (nothing.seen_to_cm == -4.0).all()
+    assert (refine_lines(*asked, RoadBorders(edges), *markings).seen_to_cm > 38.0).all()
 
 
 def test_what_passed_out_of_view_beside_the_car_is_recalled():

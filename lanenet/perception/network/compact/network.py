@@ -65,6 +65,11 @@ class Runs(Protocol):
         ...
 
 
+def is_installed() -> bool:
+    """Tell whether the compiled loops are installed."""
+    return _kernels is not None
+
+
 def is_here() -> bool:
     """Tell whether the compiled loops are installed, and this processor is one that they are for."""
     return _kernels is not None and bool(_kernels.is_fast())
