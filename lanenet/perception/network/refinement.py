@@ -100,8 +100,8 @@ class RefinedLines(NamedTuple):
         seen_at: Whether a border lies beside each label row, within ``_BESIDE_CM`` along the road.
         look: By how much the marking is yellower and redder than the floor, as a share of the contrast, and
             the share of gaps between its nearest and its farthest border; NaN where nothing was seen.
-        seen_to_cm: y, frame car, where the farthest bin along the road ends that has a border; where the first
-            one begins if nothing was seen.
+        seen_to_cm: y, frame car, where the farthest bin along the road ends that has a border; where the
+            first one begins if nothing was seen.
     """
 
     points_cm: Float[np.ndarray, "m 3"]
