@@ -1,8 +1,7 @@
 // Lines on the edge points of their markings, their corners and distances: refinement.py, corner.py and tracker.py,
-// compiled.
-// What a step means and where its numbers come from stands there. Every sum is taken in the order of the Python
-// code, in double precision, so that the bytes are equal (build with -ffp-contract=off). Arrays come as contiguous
-// buffers, whose types compiled.py sees to.
+// compiled. What a step means and where its numbers come from stands there. Every sum is taken in the order of the
+// Python code, in double precision, so that the bytes are equal (build with -ffp-contract=off). Arrays come as
+// contiguous buffers, whose types compiled.py sees to.
 
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -86,11 +85,11 @@ inline Four operator*(double factor, const Four& four) { return four * factor; }
 #endif
 
 // x of lines at y, as _line_at().
-inline Parabola parabola_of(const Numbers& s, const double* points) {
+inline Parabola parabola_of(const double* basis, const double* points) {
   double out[3];
   for (int k = 0; k < 3; ++k) {
     out[k] = 0.0;
-    for (int j = 0; j < kRows; ++j) out[k] += points[j] * s.basis[j][k];
+    for (int j = 0; j < kRows; ++j) out[k] += points[j] * basis[3 * j + k];
   }
   return {out[0], out[1], out[2]};
 }
@@ -348,7 +347,7 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
   information[3][3] = 1.0 / (marking_sigma * marking_sigma);
   for (int step = 0; any && step < kSteps; ++step) {
     const int count =
-        weigh_parabola(s, parabola_of(s, found), found[3], s.gates_cm[step], s.cauchies_cm[step], e);
+        weigh_parabola(s, parabola_of(&s.basis[0][0], found), found[3], s.gates_cm[step], s.cauchies_cm[step], e);
     enough = count >= s.least;
     if (!enough) {
       std::memcpy(found, start, sizeof start);
@@ -380,7 +379,7 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
   }
   if (!enough) return;
 
-  const Parabola line = parabola_of(s, found);
+  const Parabola line = parabola_of(&s.basis[0][0], found);
   const double a2 = 2.0 * line.a;
   for (int i = 0; i < e.n; ++i) {
     const double y = e.y[i];
@@ -525,20 +524,16 @@ template <class T>
 bool take_middles(const CornerNumbers& s, const double* line, const T* points, const T* normals, size_t n,
                   Middles& out) {
   out.found.resize(n);
-  double curve[3];
-  for (int k = 0; k < 3; ++k) {
-    curve[k] = 0.0;
-    for (int j = 0; j < kRows; ++j) curve[k] += line[j] * s.basis[j][k];
-  }
-  const double half = 0.5 * line[kRows], a2 = 2.0 * curve[0], farthest2 = s.farthest_cm * s.farthest_cm;
+  const Parabola curve = parabola_of(&s.basis[0][0], line);
+  const double half = 0.5 * line[kRows], a2 = 2.0 * curve.a, farthest2 = s.farthest_cm * s.farthest_cm;
   int count = 0, own = 0, aside = 0;
   for (size_t i = 0; i < n; ++i) {
     Middle e;
     e.normal_x = normals[2 * i], e.normal_y = normals[2 * i + 1];
     e.x = points[2 * i] + e.normal_x * half, e.y = points[2 * i + 1] + e.normal_y * half;
     if (!(e.y > s.near_cm && e.y < s.far_cm)) continue;
-    const double slope = a2 * e.y + curve[1], steep = 1.0 + slope * slope;
-    const double off = e.x - ((curve[0] * e.y + curve[1]) * e.y + curve[2]);
+    const double slope = a2 * e.y + curve.b, steep = 1.0 + slope * slope;
+    const double off = e.x - ((curve.a * e.y + curve.b) * e.y + curve.c);
     if (!(off * off < farthest2 * steep)) continue;
     const double across = 1.0 / std::sqrt(steep);
     e.off = off * across;
@@ -732,7 +727,7 @@ PyObject* refine(PyObject*, PyObject* args) {
       const double* line = asked.data() + kAsked * i;
       const double marking = line[6];
       if (any) {
-        choose(s, parabola_of(s, line), s.first_cm + s.bent_cm + std::abs(marking), near, beside);
+        choose(s, parabola_of(&s.basis[0][0], line), s.first_cm + s.bent_cm + std::abs(marking), near, beside);
         weigh_looks(s, sign_of(marking), line[8], line[9], beside);
       }
       refine_line(s, line, line + 3, marking, line[7], any, beside, out + kPerLine * i);
@@ -791,14 +786,10 @@ PyObject* distances(PyObject*, PyObject* args) {
     std::vector<double> x((l + r) * n), nearest(2 * (end - begin));
     for (size_t i = 0; i < l + r; ++i) {
       const double* points = i < l ? lefts.data() + 3 * i : rights.data() + 3 * (i - l);
-      double curve[3];
-      for (int k = 0; k < 3; ++k) {
-        curve[k] = 0.0;
-        for (int j = 0; j < 3; ++j) curve[k] += points[j] * basis.data()[3 * j + k];
-      }
+      const Parabola curve = parabola_of(basis.data(), points);
       for (int k = 0; k < n; ++k) {
         const double y = compared.data()[k];
-        x[i * n + k] = (curve[0] * y + curve[1]) * y + curve[2];
+        x[i * n + k] = (curve.a * y + curve.b) * y + curve.c;
       }
     }
     PyObject* result = PyByteArray_FromStringAndSize(nullptr, l * r * sizeof(double));

@@ -51,8 +51,6 @@ _NUMBERS = np.concatenate(
         [_NEXT_CM, _LEAST, _SPAN_CM, _BEYOND_CM, _GOES_ON],
     ]
 )
-
-
 #: Points that are compared with all others at a time, without compiled loops.
 _AT_A_TIME = 128
 

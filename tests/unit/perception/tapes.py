@@ -28,3 +28,9 @@ def turned(turn_deg: float, corner_cm: float = 60.0) -> np.ndarray:
     turn = np.radians(turn_deg)
     corner = np.array([-20.0, corner_cm])
     return np.array([[-20.0, 0.0], corner, corner + 80.0 * np.array([np.sin(turn), np.cos(turn)])])
+
+
+def together(*edges: RoadEdges) -> RoadEdges:
+    """The edge points of several tapes."""
+    points, normals = zip(*((each.points_cm, each.normals) for each in edges), strict=True)
+    return RoadEdges(np.concatenate(points), np.concatenate(normals))

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from tapes import tape, turned
+from tapes import tape, together, turned
 
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.network import compiled
@@ -20,11 +20,6 @@ STRAIGHT_CM = [-20.0] * 3
 def corner_of(edges: RoadEdges, points_cm=STRAIGHT_CM, marking_cm: float = 3.0) -> Corner | None:
     (corner,) = corners([points_cm], [marking_cm], RoadBorders(edges))
     return corner
-
-
-def both(*edges: RoadEdges) -> RoadEdges:
-    points, normals = zip(*((each.points_cm, each.normals) for each in edges), strict=True)
-    return RoadEdges(np.concatenate(points), np.concatenate(normals))
 
 
 @pytest.mark.parametrize("turn_deg", [40.0, 70.0, 85.0, 110.0])
@@ -51,14 +46,14 @@ def test_tape_that_turns_ends_its_line(turn_deg, marking_cm, mirrored):
 )
 def test_a_line_that_goes_on_has_no_corner(other):
     line = tape(np.array([[-20.0, 0.0], [-20.0, 80.0]]), 3.0)
-    assert corner_of(both(line, tape(other, 3.0))) is None
+    assert corner_of(together(line, tape(other, 3.0))) is None
 
 
 def test_a_line_that_ends_has_no_corner():
     line = tape(np.array([[-20.0, 0.0], [-20.0, 22.0]]), 3.0)
     assert corner_of(line) is None
     # What lies aside does not belong to it: there is floor between the two.
-    assert corner_of(both(line, tape(np.array([[-12.0, 26.0], [20.0, 30.0]]), 3.0))) is None
+    assert corner_of(together(line, tape(np.array([[-12.0, 26.0], [20.0, 30.0]]), 3.0))) is None
 
 
 def test_a_bend_has_no_corner():
@@ -74,7 +69,7 @@ def test_the_rim_of_a_reflection_is_no_tape():
     out = np.column_stack([np.cos(angle), np.sin(angle)])
     # It begins where the line ends, and goes on aside.
     rim = RoadEdges(out * 9.0 + (-11.0, 28.0), -out)
-    assert corner_of(both(line, rim)) is None
+    assert corner_of(together(line, rim)) is None
 
 
 def test_the_inner_line_of_a_corner_turns_before_the_outer_one():
@@ -92,8 +87,8 @@ def test_tape_that_only_ends_beside_the_line_is_no_corner():
     """Six edge points are not enough, nor is a spot of tape."""
     line = tape(np.array([[-20.0, 0.0], [-20.0, 22.0]]), 3.0)
     spot = tape(np.array([[-18.0, 23.0], [-15.0, 24.0]]), 3.0)
-    assert corner_of(both(line, spot)) is None
-    assert corner_of(both(line, tape(np.array([[-18.0, 23.0], [-6.0, 27.0]]), 3.0))) is not None
+    assert corner_of(together(line, spot)) is None
+    assert corner_of(together(line, tape(np.array([[-18.0, 23.0], [-6.0, 27.0]]), 3.0))) is not None
 
 
 def test_a_crowded_frame_is_looked_at_in_parts(monkeypatch):

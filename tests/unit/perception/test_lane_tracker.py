@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tapes import tape, turned
+from tapes import tape, together, turned
 
 from lanenet.geometry.lane import parabolas_from_points
 from lanenet.onboard.bench import example_camera
@@ -316,10 +316,7 @@ def test_nothing_is_answered_beyond_a_corner_of_the_tape(other_seen):
     # The left line turns to the right 12 cm ahead; the network has both straight on.
     shown = tape(turned(75.0, 12.0), 3.0)
     if other_seen:
-        right = edges_of(lane, sides=(1,))
-        shown = RoadEdges(
-            np.concatenate([shown.points_cm, right.points_cm]), np.concatenate([shown.normals, right.normals])
-        )
+        shown = together(shown, edges_of(lane, sides=(1,)))
     points_cm, _, _ = tracker.follow(lane, SURE, np.array([1.0, float(other_seen)]), shown)
     assert np.isfinite(points_cm).tolist() == [True, False, False, *[other_seen] * 3]
 

@@ -72,7 +72,7 @@ def is_installed() -> bool:
 
 def is_here() -> bool:
     """Tell whether the compiled loops are installed, and this processor is one that they are for."""
-    return _kernels is not None and bool(_kernels.is_fast())
+    return is_installed() and bool(_kernels.is_fast())
 
 
 def open_network(path: Path, threads: int = 1) -> tuple[Runs, ModelMeta]:
