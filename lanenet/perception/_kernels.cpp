@@ -2,8 +2,7 @@
 // logarithms are those of the C library, as Python's, and sums go from first to last, so that the bytes are equal
 // (build with -ffp-contract=off). Arrays come as contiguous buffers of doubles.
 
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "arguments.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -21,19 +20,6 @@ namespace {
 
 constexpr size_t kMost = 1024;                 // widths that are told apart
 constexpr double kLost = 1.0 / (1ull << 60);  // far less than what a sum in double precision keeps
-
-// The memory of an argument; released at the end.
-struct Buffer {
-  Py_buffer view{};
-  ~Buffer() { PyBuffer_Release(&view); }
-  double* data() const { return static_cast<double*>(view.buf); }
-  bool holds(size_t n) const { return static_cast<size_t>(view.len) == n * sizeof(double); }
-};
-
-PyObject* refuse(const char* what) {
-  PyErr_SetString(PyExc_ValueError, what);
-  return nullptr;
-}
 
 // WidthBelief._settle(): nats get their largest at 0; returns mean and variance of the logarithm.
 void settle(double* nats, const double* logs, size_t n, double* probability, double* mean, double* variance) {
@@ -58,20 +44,20 @@ PyObject* learn(PyObject*, PyObject* args) {
   if (!PyArg_ParseTuple(args, "w*y*y*w*dddddd", &nats.view, &prior.view, &logs.view, &probability.view, &log_width,
                         &sigma, &own_share, &others, &kept, &alike))
     return nullptr;
-  const size_t n = nats.view.len / sizeof(double);
+  const size_t n = nats.size<double>();
   const double log_others = std::log(others);
-  if (n < 1 || !nats.holds(n) || !prior.holds(n) || !logs.holds(n) || !probability.holds(n))
+  if (n < 1 || !prior.holds<double>(n) || !logs.holds<double>(n) || !probability.holds<double>(n))
     return refuse("belief: arrays differ in number");
   for (size_t i = 0; i < n; ++i) {
-    const double off = (logs.data()[i] - log_width) / sigma;
+    const double off = (logs.as<double>()[i] - log_width) / sigma;
     const double share = own_share * std::exp(-0.5 * (off * off));
     // Where the share is lost in rounding, which is so for most widths, the logarithm is known.
     const double likely = share < kLost * others ? log_others : std::log(share + others);
-    const double told = kept * (nats.data()[i] - prior.data()[i]) + likely / alike;
-    nats.data()[i] = prior.data()[i] + told;
+    const double told = kept * (nats.as<double>()[i] - prior.as<double>()[i]) + likely / alike;
+    nats.as<double>()[i] = prior.as<double>()[i] + told;
   }
   double mean, variance;
-  settle(nats.data(), logs.data(), n, probability.data(), &mean, &variance);
+  settle(nats.as<double>(), logs.as<double>(), n, probability.as<double>(), &mean, &variance);
   return Py_BuildValue("dd", mean, variance);
 }
 
@@ -88,18 +74,18 @@ PyObject* match(PyObject*, PyObject* args) {
   double step;
   if (!PyArg_ParseTuple(args, "y*y*y*y*d", &probability.view, &kernel.view, &logs.view, &widths.view, &step))
     return nullptr;
-  const size_t n = probability.view.len / sizeof(double), m = widths.view.len / sizeof(double);
-  if (n < 2 || n > kMost || !probability.holds(n) || !kernel.holds(2 * n - 1) || !logs.holds(n) || !widths.holds(m))
+  const size_t n = probability.size<double>(), m = widths.size<double>();
+  if (n < 2 || n > kMost || !probability.holds<double>(n) || !kernel.holds<double>(2 * n - 1) || !logs.holds<double>(n))
     return refuse("belief: arrays differ in number");
   double density[kMost];
-  spread(probability.data(), kernel.data(), n, density);
-  const double most = *std::max_element(density, density + n), *grid = logs.data();
+  spread(probability.as<double>(), kernel.as<double>(), n, density);
+  const double most = *std::max_element(density, density + n), *grid = logs.as<double>();
   PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * sizeof(double));
   if (!result) return nullptr;
   double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
   for (size_t i = 0; i < m; ++i) {
     // Written so that NaN gives the first.
-    double x = std::log(widths.data()[i]);
+    double x = std::log(widths.as<double>()[i]);
     x = x > grid[0] ? std::min(x, grid[n - 1]) : grid[0];
     const size_t below = std::min(static_cast<size_t>((x - grid[0]) / step), n - 2);
     const double share = (x - grid[below]) / (grid[below + 1] - grid[below]);

@@ -4,8 +4,7 @@
 // of the Python code (build with -ffp-contract=off). Arrays come as contiguous buffers, whose types
 // compiled.py sees to.
 
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "../arguments.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -598,22 +597,6 @@ void mark_cells(size_t n, const T* points, const T* normals, const T* hues, T le
 
 // --- Python ---
 
-// The memory of an argument; released at the end.
-struct Buffer {
-  Py_buffer view{};
-  ~Buffer() { PyBuffer_Release(&view); }
-  template <class T>
-  T* as() const {
-    return static_cast<T*>(view.buf);
-  }
-  bool holds(size_t bytes) const { return static_cast<size_t>(view.len) == bytes; }
-};
-
-PyObject* refuse(const char* what) {
-  PyErr_SetString(PyExc_ValueError, what);
-  return nullptr;
-}
-
 // What is found in a frame: its edge points are in s.candidates.
 struct Search {
   Buffer frame, keep, sample;
@@ -624,23 +607,23 @@ struct Search {
   const char* fault() const {
     if (height < 3 || width < 3) return "image: expected at least 3 x 3 pixels";
     const size_t size = static_cast<size_t>(height) * width;
-    if (!frame.holds(3 * size) && !frame.holds(size)) return "frame: not of this size";
-    if (keep.view.buf && !keep.holds(size)) return "keep: not of the frame's size";
+    if (!frame.holds<uint8_t>(3 * size) && !frame.holds<uint8_t>(size)) return "frame: not of this size";
+    if (keep.view.buf && !keep.holds<uint8_t>(size)) return "keep: not of the frame's size";
     const int64_t* at = sample.as<int64_t>();
     bool beyond = false;
-    for (size_t i = 0; i < sample.view.len / sizeof(int64_t); ++i) beyond |= static_cast<uint64_t>(at[i]) >= size;
+    for (size_t i = 0; i < sample.size<int64_t>(); ++i) beyond |= static_cast<uint64_t>(at[i]) >= size;
     return beyond ? "sample: beyond the frame" : nullptr;
   }
 
   void run(Scratch& s) {
-    const bool coloured = frame.holds(3 * static_cast<size_t>(height) * width);
+    const bool coloured = frame.holds<uint8_t>(3 * static_cast<size_t>(height) * width);
     if (!coloured) weight = 0.0;
     find_slopes(s, frame.as<uint8_t>(), height, width, coloured, blur_px, weight,
                 weight > 0.0 ? static_cast<int>(std::min(low / weight, 254.0)) : 0);
     double raised = 1.0;
     if (share > 0.0) {
       double usual, strong;
-      find_responses(s, sample.as<int64_t>(), sample.view.len / sizeof(int64_t), width, &usual, &strong);
+      find_responses(s, sample.as<int64_t>(), sample.size<int64_t>(), width, &usual, &strong);
       const double relative = share * (strong / high);
       raised =
           std::max(relative, std::min(1.0, std::max({dim * relative, least_raised, clear * (usual / high)})));
@@ -711,7 +694,7 @@ PyObject* extract(PyObject*, PyObject* args) {
                         &search.clear, &table.view, &first, &rows))
     return nullptr;
   if (const char* fault = search.fault()) return refuse(fault);
-  if (rows < 1 || !table.holds(6 * sizeof(double) * rows * search.width)) return refuse("table: not of this size");
+  if (rows < 1 || !table.holds<double>(6 * rows * search.width)) return refuse("table: not of this size");
   try {
     Scratch& s = scratch();
     search.run(s);
@@ -765,9 +748,9 @@ PyObject* lift(PyObject*, PyObject* args) {
                         &width, &single))
     return nullptr;
   const size_t n = uv.view.len / (2 * sizeof(double));
-  if (!normals.holds(uv.view.len) || (hues.view.buf && !hues.holds(uv.view.len)))
+  if (!normals.holds<uint8_t>(uv.view.len) || (hues.view.buf && !hues.holds<uint8_t>(uv.view.len)))
     return refuse("edges: positions, normals and hues differ in number");
-  if (height < 1 || width < 1 || !table.holds(6 * sizeof(double) * height * width))
+  if (height < 1 || width < 1 || !table.holds<double>(6 * height * width))
     return refuse("table: not of this size");
   return single ? lifted<float>(n, uv, normals, hues, table, height, width, true)
                 : lifted<double>(n, uv, normals, hues, table, height, width, false);
@@ -780,10 +763,10 @@ PyObject* raster(PyObject*, PyObject* args) {
   if (!PyArg_ParseTuple(args, "y*y*z*w*dddiiiidp", &points.view, &normals.view, &hues.view, &out.view,
                         &left_cm, &far_cm, &cell_cm, &rows, &columns, &planes, &middle, &steps, &single))
     return nullptr;
-  if (!normals.holds(points.view.len) || (hues.view.buf && !hues.holds(points.view.len)))
+  if (!normals.holds<uint8_t>(points.view.len) || (hues.view.buf && !hues.holds<uint8_t>(points.view.len)))
     return refuse("edges: points, normals and hues differ in number");
   if (rows < 1 || columns < 1 || planes < 1 || planes > 5 ||
-      !out.holds(static_cast<size_t>(planes) * rows * columns))
+      !out.holds<uint8_t>(static_cast<size_t>(planes) * rows * columns))
     return refuse("raster: not of this size");
   const auto fill = [&](auto type) {
     using T = decltype(type);

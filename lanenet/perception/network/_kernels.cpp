@@ -1,10 +1,9 @@
-// Lines on the edge points of their markings, their corners and distances: refinement.py, corner.py and tracker.py,
-// compiled. What a step means and where its numbers come from stands there. Every sum is taken in the order of the
-// Python code, in double precision, so that the bytes are equal (build with -ffp-contract=off). Arrays come as
-// contiguous buffers, whose types compiled.py sees to.
+// Lines on the edge points of their markings, their corners and distances: refinement.py, corner.py and
+// tracking/pair.py, compiled. What a step means and where its numbers come from stands there. Every sum is taken in the
+// order of the Python code, in double precision, so that the bytes are equal (build with -ffp-contract=off). Arrays
+// come as contiguous buffers, whose types compiled.py sees to.
 
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "../arguments.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -671,31 +670,14 @@ void find_corner(const CornerNumbers& s, Middles& e, double* out) {
 
 // --- Python ---
 
-// The memory of an argument; released at the end.
-struct Buffer {
-  Py_buffer view{};
-  ~Buffer() { PyBuffer_Release(&view); }
-  template <class T>
-  const T* as() const {
-    return static_cast<const T*>(view.buf);
-  }
-  const double* data() const { return as<double>(); }
-  size_t size() const { return view.len / sizeof(double); }
-};
-
-PyObject* refuse(const char* what) {
-  PyErr_SetString(PyExc_ValueError, what);
-  return nullptr;
-}
-
 PyObject* refine(PyObject*, PyObject* args) {
   Buffer asked, edges, normals, edge_hues, numbers;
   int single;
   if (!PyArg_ParseTuple(args, "y*y*y*z*y*p", &asked.view, &edges.view, &normals.view, &edge_hues.view, &numbers.view,
                         &single))
     return nullptr;
-  if (asked.size() % kAsked) return refuse("lines: points, sigmas, markings and hues differ in number");
-  const size_t m = asked.size() / kAsked;
+  if (asked.size<double>() % kAsked) return refuse("lines: points, sigmas, markings and hues differ in number");
+  const size_t m = asked.size<double>() / kAsked;
   const size_t pair = 2 * (single ? sizeof(float) : sizeof(double));
   if (edges.view.len % pair || normals.view.len != edges.view.len ||
       (edge_hues.view.buf && edge_hues.view.len != edges.view.len))
@@ -724,7 +706,7 @@ PyObject* refine(PyObject*, PyObject* args) {
     else take(double{});
     const bool any = near.count >= s.least;
     for (size_t i = 0; i < m; ++i) {
-      const double* line = asked.data() + kAsked * i;
+      const double* line = asked.as<double>() + kAsked * i;
       const double marking = line[6];
       if (any) {
         choose(s, parabola_of(&s.basis[0][0], line), s.first_cm + s.bent_cm + std::abs(marking), near, beside);
@@ -744,8 +726,8 @@ PyObject* corners(PyObject*, PyObject* args) {
   int single;
   if (!PyArg_ParseTuple(args, "y*y*y*y*p", &lines.view, &edges.view, &normals.view, &numbers.view, &single))
     return nullptr;
-  if (lines.size() % (kRows + 1)) return refuse("lines: points and markings differ in number");
-  const size_t m = lines.size() / (kRows + 1), pair = 2 * (single ? sizeof(float) : sizeof(double));
+  if (lines.size<double>() % (kRows + 1)) return refuse("lines: points and markings differ in number");
+  const size_t m = lines.size<double>() / (kRows + 1), pair = 2 * (single ? sizeof(float) : sizeof(double));
   if (edges.view.len % pair || normals.view.len != edges.view.len)
     return refuse("edges: points and normals differ in number");
   if (numbers.view.len != sizeof(CornerNumbers)) return refuse("numbers: not of this size");
@@ -761,9 +743,9 @@ PyObject* corners(PyObject*, PyObject* args) {
     std::fill_n(out, m * kPerCorner, kNaN);
     const size_t n = edges.view.len / pair;
     for (size_t i = 0; i < m; ++i) {
-      const double* line = lines.data() + (kRows + 1) * i;
+      const double* line = lines.as<double>() + (kRows + 1) * i;
       const bool any = single ? take_middles(s, line, edges.as<float>(), normals.as<float>(), n, middles)
-                              : take_middles(s, line, edges.data(), normals.data(), n, middles);
+                              : take_middles(s, line, edges.as<double>(), normals.as<double>(), n, middles);
       if (any) find_corner(s, middles, out + kPerCorner * i);
     }
     return result;
@@ -778,27 +760,26 @@ PyObject* distances(PyObject*, PyObject* args) {
   int begin, end;
   if (!PyArg_ParseTuple(args, "y*y*y*y*ii", &lefts.view, &rights.view, &basis.view, &compared.view, &begin, &end))
     return nullptr;
-  if (lefts.size() % 3 || rights.size() % 3 || basis.size() != 9) return refuse("lines: expected three points each");
-  const int n = static_cast<int>(compared.size());
+  if (lefts.size<double>() % 3 || rights.size<double>() % 3 || basis.size<double>() != 9)
+    return refuse("lines: expected three points each");
+  const int n = static_cast<int>(compared.size<double>());
   if (begin < 0 || end <= begin || end > n) return refuse("compared: nothing lies between");
   try {
-    const size_t l = lefts.size() / 3, r = rights.size() / 3;
+    const size_t l = lefts.size<double>() / 3, r = rights.size<double>() / 3;
+    const double* y = compared.as<double>();
     std::vector<double> x((l + r) * n), nearest(2 * (end - begin));
     for (size_t i = 0; i < l + r; ++i) {
-      const double* points = i < l ? lefts.data() + 3 * i : rights.data() + 3 * (i - l);
-      const Parabola curve = parabola_of(basis.data(), points);
-      for (int k = 0; k < n; ++k) {
-        const double y = compared.data()[k];
-        x[i * n + k] = (curve.a * y + curve.b) * y + curve.c;
-      }
+      const double* points = i < l ? lefts.as<double>() + 3 * i : rights.as<double>() + 3 * (i - l);
+      const Parabola curve = parabola_of(basis.as<double>(), points);
+      for (int k = 0; k < n; ++k) x[i * n + k] = (curve.a * y[k] + curve.b) * y[k] + curve.c;
     }
     PyObject* result = PyByteArray_FromStringAndSize(nullptr, l * r * sizeof(double));
     if (!result) return nullptr;
     double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
     for (size_t i = 0; i < l; ++i)
       for (size_t j = 0; j < r; ++j) {
-        const double gap = rights.data()[3 * j + 1] - lefts.data()[3 * i + 1];
-        *out++ = distance_of(&x[i * n], &x[(l + j) * n], compared.data(), n, begin, end, nearest.data()) * sign_of(gap);
+        const double gap = rights.as<double>()[3 * j + 1] - lefts.as<double>()[3 * i + 1];
+        *out++ = distance_of(&x[i * n], &x[(l + j) * n], y, n, begin, end, nearest.data()) * sign_of(gap);
       }
     return result;
   } catch (const std::exception&) {

@@ -2,8 +2,7 @@
 // are in an order of their own, so that the answers are those of onnxruntime but for the last digits (build with
 // -ffp-contract=fast). Arrays come as contiguous buffers, whose types network.py sees to.
 
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "../../arguments.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -210,20 +209,6 @@ void answer(const float* outputs, const float* tail, int bins, double* found) {
 
 // --- Python ---
 
-// The memory of an argument; released at the end.
-struct Buffer {
-  Py_buffer view{};
-  ~Buffer() { PyBuffer_Release(&view); }
-  template <class T>
-  const T* as() const {
-    return static_cast<const T*>(view.buf);
-  }
-  template <class T>
-  Py_ssize_t size() const {
-    return view.len / Py_ssize_t{sizeof(T)};
-  }
-};
-
 // Adds what a lane's width adds to the biases, by how near it is to each of some widths.
 void tell_width(double width_cm, double sigma, const Buffer& log_widths, const float* by_width,
                 std::vector<float>& biases) {
@@ -233,11 +218,6 @@ void tell_width(double width_cm, double sigma, const Buffer& log_widths, const f
     const float near = static_cast<float>(std::exp(-0.5 * off * off));
     for (size_t i = 0; i < biases.size(); ++i) biases[i] += near * by_width[i];
   }
-}
-
-PyObject* refuse(const char* what) {
-  PyErr_SetString(PyExc_ValueError, what);
-  return nullptr;
 }
 
 PyObject* run(PyObject*, PyObject* args) {
