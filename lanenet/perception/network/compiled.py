@@ -64,7 +64,7 @@ def distances(
     compared: Float[np.ndarray, "k"],
     between: tuple[int, int],
 ) -> Float[np.ndarray, "l r"]:
-    """Compare lines as :func:`lanenet.perception.network.tracker.distances_cm` does.
+    """Compare lines as :func:`lanenet.perception.network.tracking.pair.distances_cm` does.
 
     Args:
         lefts_cm: x at the label rows.

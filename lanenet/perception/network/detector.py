@@ -17,11 +17,11 @@ from lanenet.geometry.lane import ROWS_CM, lane_width_cm, parabola_through, prop
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
-from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.compact.network import ANSWERS, open_network
-from lanenet.perception.network.lane_belief import Keep
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta
-from lanenet.perception.network.tracker import LaneTracker
+from lanenet.perception.network.tracking.camera_view import CameraView
+from lanenet.perception.network.tracking.lane_belief import Keep
+from lanenet.perception.network.tracking.tracker import LaneTracker
 
 log = logging.getLogger(__name__)
 
@@ -117,10 +117,10 @@ class NetworkDetector:
             self.memory.reset()
             self._tracker.reset()
         edges = self._extractor.extract(frame_bgr)
-        if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE):
-            return LaneEstimate()
-        raster = fill_raster(self.meta.window, edges, self._raster)
-        if not np.count_nonzero(raster[0]):
+        if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE) or not np.count_nonzero(
+            fill_raster(self.meta.window, edges, self._raster)[0]
+        ):
+            self._tracker.lose()
             return LaneEstimate()
         points_cm, sigma_cm, presence = self._run()
         points_cm, sigma_cm, seen_cm = self._tracker.follow(points_cm, sigma_cm, presence, edges)

@@ -9,7 +9,7 @@ import pytest
 
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.onboard.bench import example_camera
-from lanenet.perception.network.camera_view import CameraView
+from lanenet.perception.network.tracking.camera_view import CameraView
 
 CAMERA = example_camera()
 VIEW = CameraView(CAMERA)

@@ -19,7 +19,7 @@ from lanenet.perception.network import compiled, corner, refinement
 from lanenet.perception.network.corner import corners
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.network.refinement import RoadBorders, refine_lines
-from lanenet.perception.network.tracker import distances_cm
+from lanenet.perception.network.tracking.pair import distances_cm
 
 pytestmark = pytest.mark.skipif(not compiled.is_here(), reason="installed without a C++ compiler")
 GENERAL = Path(__file__).parents[3] / "checkpoints" / "general"

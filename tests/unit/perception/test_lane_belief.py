@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from lanenet.perception.network.lane_belief import LineLooks
+from lanenet.perception.network.tracking.lane_belief import LineLooks
 
 YELLOW_DASHES, WHITE = [0.8, 0.2, 0.2], [0.0, 0.0, 0.02]
 WHITE_DASHES = [0.0, 0.0, 0.25]

@@ -12,10 +12,11 @@ from lanenet.geometry.lane import parabolas_from_points
 from lanenet.onboard.bench import example_camera
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
-from lanenet.perception.network import tracker as tracker_module
-from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.refinement import RoadBorders, refine_lines
-from lanenet.perception.network.tracker import LaneTracker, distances_cm
+from lanenet.perception.network.tracking import tracker as tracker_module
+from lanenet.perception.network.tracking.camera_view import CameraView
+from lanenet.perception.network.tracking.pair import distances_cm
+from lanenet.perception.network.tracking.tracker import LaneTracker
 
 LANE_CM = 40.0
 BENT = np.array([-20.0, -19.0, -16.0, 20.0, 21.0, 24.0])
@@ -319,6 +320,42 @@ def test_nothing_is_answered_beyond_a_corner_of_the_tape(other_seen):
         shown = together(shown, edges_of(lane, sides=(1,)))
     points_cm, _, _ = tracker.follow(lane, SURE, np.array([1.0, float(other_seen)]), shown)
     assert np.isfinite(points_cm).tolist() == [True, False, False, *[other_seen] * 3]
+
+
+def test_what_lies_beyond_a_corner_does_not_make_the_line_go_on():
+    lane = np.repeat([-20.0, 20.0], 3)
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for _ in range(12):
+        tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    # One border of something else lies on the line's continuation.
+    onward = edges_of(lane)
+    beyond = onward.rows()[(onward.points_cm[:, 0] < -20.0) & (onward.points_cm[:, 1] > 36.0)]
+    shown = together(tape(turned(75.0, 12.0), 3.0), edges_of(lane, sides=(1,)), RoadEdges.of_rows(beyond))
+    points_cm, _, _ = tracker.follow(lane, SURE, SEEN, shown)
+    assert np.isfinite(points_cm).tolist() == [True, False, False, True, True, True]
+
+
+@pytest.mark.parametrize(("frames", "sides", "answered"), [(3, (1,), 0), (3, (0, 1), 6), (2, (1,), 6)])
+def test_a_lost_lane_is_found_again_with_both_of_its_lines(frames, sides, answered):
+    lane = np.repeat([-20.0, 20.0], 3)
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    for _ in range(frames):
+        tracker.lose()
+    presence = np.array([float(0 in sides), 1.0])
+    points_cm, sigma_cm, _ = tracker.follow(lane, SURE, presence, edges_of(lane, sides=sides))
+    assert np.isfinite(points_cm).sum() == np.isfinite(sigma_cm).sum() == answered
+
+
+def test_a_lane_is_lost_where_nothing_of_it_is_known():
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    lane, unsure = np.repeat([-20.0, 20.0], 3), np.full(6, 9.0)
+    nothing = RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
+    tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    known = [np.isfinite(tracker.follow(lane, unsure, 0.1 * SEEN, nothing)[0]).any() for _ in range(16)]
+    assert known[0] and not any(known[-3:])
+    points_cm, _, _ = tracker.follow(lane, SURE, np.array([0.0, 1.0]), edges_of(lane, sides=(1,)))
+    assert np.isnan(points_cm).all()
 
 
 def test_where_both_lines_go_on_no_corner_is_looked_for(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from tapes import tape, turned
 
 from lanenet.perception.edges.road import RoadEdges
-from lanenet.perception.network.line_beside import SeenLine, WidthHere, line_beside
+from lanenet.perception.network.tracking.line_beside import SeenLine, WidthHere, line_beside
 
 LANE_CM = 40.0
 

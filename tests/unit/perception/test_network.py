@@ -23,6 +23,7 @@ from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.network.model_file import HASH_NAME, ModelMeta, read_model_meta, sealed
+from lanenet.perception.network.tracking.tracker import LaneTracker
 from lanenet.perception.registry import build_detector
 
 torch.set_num_threads(1)
@@ -318,6 +319,19 @@ def test_a_frame_of_noise_gives_no_lane(model_path):
     noise = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
     estimate = NetworkDetector(model_path, CAMERA).detect(noise)
     assert not estimate.mask.any() and estimate.confidence == 0.0
+
+
+@pytest.mark.parametrize("frame", ["noise", "dark"])
+def test_the_lane_is_lost_in_frames_that_show_nothing(model_path, monkeypatch, frame):
+    lost = []
+    monkeypatch.setattr(LaneTracker, "lose", lambda self: lost.append(1))
+    detector = NetworkDetector(model_path, CAMERA)
+    shape = CAMERA.height, CAMERA.width, 3
+    noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    detector.detect(striped_frame())
+    assert not lost
+    detector.detect(noise if frame == "noise" else np.zeros(shape, np.uint8))
+    assert lost
 
 
 def test_a_network_that_takes_the_width_gets_it(width_model_path, monkeypatch):

@@ -8,9 +8,9 @@ import pytest
 from lanenet.onboard.bench import example_camera
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import LaneMemory
-from lanenet.perception.network.camera_view import CameraView
-from lanenet.perception.network.straight_on import SeenLines, StraightOn, turns_away_cm
-from lanenet.perception.network.tracker import LaneTracker
+from lanenet.perception.network.tracking.camera_view import CameraView
+from lanenet.perception.network.tracking.straight_on import SeenLines, StraightOn, turns_away_cm
+from lanenet.perception.network.tracking.tracker import LaneTracker
 
 WIDTH_CM, WHEELBASE_CM = 40.0, 17.0
 LANE = np.array([[-20.0, -20.0, -20.0], [20.0, 20.0, 20.0]])

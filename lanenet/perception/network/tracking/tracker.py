@@ -18,14 +18,15 @@ from jaxtyping import Float
 from lanenet.geometry.lane import ROWS_CM, SIDES, parallel_points
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.estimate import SEEN, SURE, LaneMemory
-from lanenet.perception.network import compiled
-from lanenet.perception.network.camera_view import CameraView
 from lanenet.perception.network.corner import corners
-from lanenet.perception.network.lane_belief import Keep, LineLooks
-from lanenet.perception.network.line_beside import SeenLine, WidthHere, line_beside
-from lanenet.perception.network.refinement import BASIS, RoadBorders, line_at, refined
-from lanenet.perception.network.straight_on import SeenLines, StraightOn
-from lanenet.perception.rolling_median import RollingMedian
+from lanenet.perception.network.refinement import RoadBorders, refined
+from lanenet.perception.network.tracking.camera_view import CameraView
+from lanenet.perception.network.tracking.lane_belief import Keep, LineLooks
+from lanenet.perception.network.tracking.line_beside import SeenLine, WidthHere, line_beside
+from lanenet.perception.network.tracking.marking_widths import MarkingWidths
+from lanenet.perception.network.tracking.pair import Candidate, Pair, best_pair, tells_width
+from lanenet.perception.network.tracking.straight_on import SeenLines, StraightOn
+from lanenet.perception.network.tracking.which_lane import WhichLane
 
 #: Factor on a network's own sigma. On nine drives, eight simulated, refined lines lay within one and two
 #: sigma in 66 and 90 % with it, in 51 and 80 % without.
@@ -35,50 +36,17 @@ _LEAST_PRESENCE = 0.3
 #: Sigma of what changes at the label rows from one frame to the next. Chosen: a car at 1 m/s and 20 frames/s
 #: moves by 5 cm between two, and turns by 0.1 rad in the tightest bend.
 _MOVED_CM = (2.0, 3.0, 5.0)
-#: Width of a marking before any was seen, and its sigma; its sigma once so many were seen; so many count.
-_MARKING_CM, _MARKING_SIGMA_CM, _KNOWN_SIGMA_CM, _ENOUGH, _LENGTH = 3.0, 2.0, 0.3, 10, 50
-#: Once markings are known, they are measured without that knowledge every so many frames. Chosen.
-_MEASURED_EVERY = 4
+#: Width of a marking before any was seen, and its sigma; its sigma once it is known. Chosen.
+_MARKING_CM, _MARKING_SIGMA_CM, _KNOWN_SIGMA_CM = 3.0, 2.0, 0.3
 #: Length along the road, [cm], in which a border has to be seen for a width to count, and for a line to.
 _WIDTH_SEEN_CM, _LINE_SEEN_CM = 12.0, 9.0
-#: What speaks for a pair of lines, in centimetres of seen borders: the presence that the network gives it,
-#: that it continues the last frame's; what its width costs at most, and sigma of the width's logarithm. The
-#: last two were tried: a lane may widen in plain sight, but the line of another lane is none of its own.
-_BY_PRESENCE_CM, _BY_CONTINUING_CM, _BY_WIDTH_CM, _WIDTH_SIGMA = 6.0, 3.0, 45.0, 0.2
-#: What speaks for the network's own pair, if it has the lane's width, while the front axle's middle is within
-#: this share of that width of a line: it has learned from the labels in which lane a car on a line is. Tried:
-#: 18 and 36 cm; and for each of its lines apart, which took dashes inside a lane for its border.
-_BY_BOTH_CM, _ON_LINE = 18.0, 0.12
-#: What it costs at most that the front axle's middle is not between the two, and how far beside them that is.
-#: Chosen: more than what a network's opinion brings, less than a line that is not to be seen.
-_BY_OUTSIDE_CM, _OUTSIDE_CM = 20.0, 2.0
-#: In which lane a car is cannot be told if less than so much more, [cm], speaks for its pair than for one
-#: that lies this share of the lane's width beside it; nor if the front axle's middle is within the last share
-#: of a line. On 144 simulated drives of five seeds 0.4 % fewer points are answered for it, and their RMSE is
-#: 1.78 instead of 2.40 cm; where the other line is seen as well, on 120 drives, 0.3 % fewer, 2.13 instead of
-#: 2.26 cm over all points. Tried: 2 to 50 cm, and shares of 0.02 to 0.12; with one sigma more where the
-#: lane's other line is not to be seen 0.1 % fewer points are answered, and the RMSE is the same. Once that is
-#: so, the pair beside the chosen one is looked for in the next frame as well: on 264 drives of eleven seeds
-#: 0.1 % fewer points are answered for it, and their RMSE is 1.46 instead of 1.58 cm. With it 9, 13, 22 and 26
-#: cm gave 1.38, 1.33, 1.31 and 1.31 cm, where 18 gave 1.32.
-_UNDECIDED_CM, _NEXT_LANE, _ASTRIDE = 18.0, 0.5, 0.02
-#: Within this share of the lane's width of a line nothing is answered while the network does not see that
-#: line, nor, after the car has come over it, before the lane beyond has shown both of its lines. On the 264
-#: drives 0.3 % fewer points are answered for it, and their RMSE is 1.31 instead of 1.46 cm. Tried: 0.15, 0.2
-#: and 0.3 gave 1.43, 1.32 and 1.30 cm, 96.4, 96.3 and 96.0 %. After a crossing at any distance: 0.3 % fewer
-#: points, the same RMSE.
-_NEAR_LINE = 0.25
+#: What speaks for a line, in centimetres of seen borders: the presence that the network gives it, and that it
+#: continues the last frame's. Chosen.
+_BY_PRESENCE_CM, _BY_CONTINUING_CM = 6.0, 3.0
 #: Length in which a line beyond a crossed one has to be seen. A single border, as that of a mat, is seen over
 #: half of the 46 cm that count.
 _BEYOND_SEEN_CM = 26.0
-#: Narrower than this share of the lane's width no pair is a lane.
-_NARROWEST = 0.3
 _MIDDLE = 1
-#: Length along the road in which both lines have to be seen to tell the lane's width, as lines that the
-#: network sees, too: the rim of a reflection that is found again in each frame tells none. On 120 simulated
-#: drives without a given width the RMSE is 2.54 instead of 3.60 cm for it. Tried: 9, 15 and 21 cm gave 2.58,
-#: 2.55 and 2.28 cm, and 94.8, 94.1 and 92.9 % of the points are answered.
-_TELLS_WIDTH_CM = 15.0
 #: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
 #: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
 _BARELY_CM, _AHEAD = 2.0, 3.0
@@ -112,13 +80,13 @@ _ENDED = 0.62
 #: So far beyond a corner a line still holds. Tried: 0, 2 and 4 cm refuse 79, 56 and 40 points that are more
 #: than 2 cm off on 144 simulated drives, and 109, 90 and 76 others.
 _CORNER_CM = 2.0
-#: A line that is seen up to there has no corner within the label rows. Chosen: one bin of its borders more
-#: than a corner at the last row leaves of them.
-_GOES_ON_CM = 38.0
+#: A line that is seen up to there, and over so much on the way, has no corner within the label rows. Chosen:
+#: one bin of its borders more than a corner at the last row leaves of them; two thirds of the way, since what
+#: lies beyond the corner may be the border of something else.
+_GOES_ON_CM, _GOES_ON_SEEN_CM = 38.0, 28.0
 #: The other line of a bend is found within this share of the width of where it is expected. Chosen.
 _BESIDE = 0.1
 _NOWHERE, _UNSEEN = [False] * len(ROWS_CM), [math.nan] * len(ROWS_CM)
-_CERTAIN = np.ones(len(SIDES))
 
 
 # Below, lines are plain numbers: for so few of them arrays cost more than their sums.
@@ -159,20 +127,6 @@ class _Found(NamedTuple):
         return cls(row[:3], row[3:6], row[6], row[7], list(map(bool, row[8:11])), row[11:14], row[14])
 
 
-class _Candidate(NamedTuple):
-    """One line that may be the answer: its points, their sigmas, and what speaks for it."""
-
-    points_cm: list[float]
-    sigma_cm: list[float]
-    seen_cm: float
-    score_cm: float
-    seen_at: list[bool]
-    look: list[float]
-    presence: float = 0.0
-    marking_cm: float = _MARKING_CM
-    seen_to_cm: float = -math.inf
-
-
 #: Points, or sigmas, of the left and of the right line.
 _Both = list[list[float]]
 
@@ -189,22 +143,21 @@ class LaneTracker:
         self.lane = lane
         self.looks = LineLooks(keep)
         self._last: tuple[_Both, _Both] | None = None
-        self._rival: tuple[_Candidate, _Candidate] | None = None
-        self._entered = False
+        self._rival: Pair | None = None
+        self._which_lane = WhichLane()
         self.straight_on = StraightOn()
         self._view = view
-        self._markings_cm = [RollingMedian(_LENGTH), RollingMedian(_LENGTH)]
+        self._markings = MarkingWidths()
         self._width_here = WidthHere()
-        self._frames = 0
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
-        self._last, self._rival, self._entered, self._frames = None, None, False, 0
+        self._last = self._rival = None
+        self._which_lane.reset()
         self.straight_on.reset()
         self.looks.reset()
         self._width_here.reset()
-        for widths_cm in self._markings_cm:
-            widths_cm.clear()
+        self._markings.reset()
 
     def follow(
         self,
@@ -233,14 +186,17 @@ class LaneTracker:
         # In one go, since each look at the edge points has a price.
         found = self._refine([*starts, *measured], borders)
         looked_for, measures = found[: len(starts)], found[len(starts) :]
-        pair, across_cm, decided = self._best_pair(self._candidates(starts, looked_for, own, present))
+        candidates = self._candidates(starts, looked_for, own, present)
+        beside_cm = math.inf if self._last is None else self._nearest_line()[1]
+        pair, across_cm, self._rival = best_pair(*candidates, self.lane, beside_cm)
+        decided = self._rival is None
         if self._at_junction(pair, present, borders):
             continued_cm, continued_sigma_cm = (x.ravel().tolist() for x in self.straight_on.lane())
             self._last = _both(continued_cm), _both(continued_sigma_cm)
             self._width_here.look(None)
             return (*self._known(continued_cm, continued_sigma_cm, continued_cm), np.zeros(len(SIDES)))
         self._notice_change(pair)
-        self._width_here.look(across_cm if decided and _is_plain(pair) else None)
+        self._width_here.look(across_cm if decided and tells_width(pair) else None)
         self._learn_markings(pair, zip(measured, measures, strict=True))
         for side, line in enumerate(pair):
             if line.seen_cm >= _WIDTH_SEEN_CM:
@@ -261,17 +217,23 @@ class LaneTracker:
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
                 found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = math.inf
         self._doubt_beyond_corners(pair, present, borders, found_sigma_cm)
-        if decided:
-            self._arrive(pair, present)
-        if not decided or self._side_is_a_guess(present):
+        if not decided or not self._knows_side(pair, present):
             found_sigma_cm = [math.inf] * len(found_cm)
-        known = self._known(found_cm, found_sigma_cm, network_cm)
-        return (*known, np.array([left.seen_cm, right.seen_cm]))
+        known_cm, known_sigma_cm = self._known(found_cm, found_sigma_cm, network_cm)
+        if np.isnan(known_cm).all():
+            self.lose()
+        elif not self._which_lane.is_found(_are_shown(pair, present)):
+            known_cm[:] = known_sigma_cm[:] = math.nan
+        return known_cm, known_sigma_cm, np.array([left.seen_cm, right.seen_cm])
+
+    def lose(self) -> None:
+        """Take a frame that shows nothing of the lane."""
+        self._which_lane.lose()
 
     def _tell_other(
         self,
         side: int,
-        line: _Candidate,
+        line: Candidate,
         found_cm: list[float],
         found_sigma_cm: list[float],
         edges: RoadEdges,
@@ -280,7 +242,7 @@ class LaneTracker:
         width_cm = self.lane.width_cm
         if width_cm is None:
             return
-        marking_cm = self._usual_marking_cm(side) or _MARKING_CM
+        marking_cm = self._markings.usual_cm(side) or _MARKING_CM
         seen = SeenLine(side, np.array(line.points_cm), line.seen_at[-1], marking_cm)
         own, other = len(ROWS_CM) * side, len(ROWS_CM) * (1 - side)
         usual_sigma_cm = self.lane.width_sigma * width_cm
@@ -294,7 +256,7 @@ class LaneTracker:
 
     def _doubt_beyond_corners(
         self,
-        pair: tuple[_Candidate, _Candidate],
+        pair: Pair,
         presence: list[float],
         borders: RoadBorders,
         found_sigma_cm: list[float],
@@ -305,7 +267,9 @@ class LaneTracker:
         """
         seen = [side for side, line in enumerate(pair) if line.seen_cm >= _LINE_SEEN_CM]
         plain = [side for side in seen if presence[side] >= SEEN]
-        if len(plain) == len(pair) and min(line.seen_to_cm for line in pair) >= _GOES_ON_CM:
+        if len(plain) == len(pair) and all(
+            line.seen_to_cm >= _GOES_ON_CM and line.seen_cm >= _GOES_ON_SEEN_CM for line in pair
+        ):
             return
         lines = [pair[side] for side in seen]
         found = corners([line.points_cm for line in lines], [line.marking_cm for line in lines], borders)
@@ -323,7 +287,7 @@ class LaneTracker:
 
     def _recall_near(
         self,
-        pair: tuple[_Candidate, _Candidate],
+        pair: Pair,
         found_cm: list[float],
         found_sigma_cm: list[float],
     ) -> None:
@@ -358,9 +322,9 @@ class LaneTracker:
 
     def _candidates(
         self, starts: list[_Start], found: list[_Found], own: tuple[_Both, _Both], presence: list[float]
-    ) -> tuple[list[_Candidate], list[_Candidate]]:
+    ) -> tuple[list[Candidate], list[Candidate]]:
         """Rate what the left and the right line may be; the last of each is the network's, as it is."""
-        candidates: tuple[list[_Candidate], list[_Candidate]] = ([], [])
+        candidates: tuple[list[Candidate], list[Candidate]] = ([], [])
         for start, line in zip(starts, found, strict=True):
             if start.beyond and line.seen_cm < _BEYOND_SEEN_CM:
                 continue
@@ -369,11 +333,12 @@ class LaneTracker:
             score_cm -= _BY_LOOK_CM * self.looks.unlike(start.known_as, line.look)
             points_cm, sigma_cm, marking_cm, seen_cm, seen_at, look, seen_to_cm = line
             as_seen = points_cm, sigma_cm, seen_cm, score_cm, seen_at, look
-            rated = _Candidate(*as_seen, start.presence, marking_cm, seen_to_cm)
+            rated = Candidate(*as_seen, marking_cm, start.presence, seen_to_cm)
             candidates[start.side].append(rated)
         for side, lines in enumerate(candidates):
             doubt_cm = _BY_PRESENCE_CM * (presence[side] - 0.5)
-            lines.append(_Candidate(own[0][side], own[1][side], 0.0, doubt_cm, _NOWHERE, _UNSEEN))
+            unseen = 0.0, doubt_cm, _NOWHERE, _UNSEEN, _MARKING_CM
+            lines.append(Candidate(own[0][side], own[1][side], *unseen))
         return candidates
 
     def _starts(self, own: tuple[_Both, _Both], presence: list[float]) -> list[_Start]:
@@ -396,29 +361,18 @@ class LaneTracker:
         return starts
 
     def _nearest_line(self) -> tuple[int, float]:
-        """Return the lane's line that is nearest to the front axle's middle, and how far, in lane widths."""
+        """Return the lane's line that is nearest to the front axle's middle, and how far that is, [cm]."""
         assert self._last is not None
         beside_cm = [abs(line_cm[0]) for line_cm in self._last[0]]
         side = beside_cm.index(min(beside_cm))
-        return side, beside_cm[side] / self.lane.likely_cm
+        return side, beside_cm[side]
 
-    def _on_line(self) -> bool:
-        """Return whether the front axle's middle was on one of the lane's lines."""
-        return self._last is not None and self._nearest_line()[1] < _ON_LINE
-
-    def _arrive(self, pair: tuple[_Candidate, _Candidate], presence: list[float]) -> None:
-        """End a change of lane, once the new one has shown both of its lines, or the crossed one is far."""
-        if self._entered:
-            shown = all(
-                line.seen_cm >= _WIDTH_SEEN_CM and p > SEEN for line, p in zip(pair, presence, strict=True)
-            )
-            self._entered = not shown and self._nearest_line()[1] < _NEAR_LINE
-
-    def _side_is_a_guess(self, presence: list[float]) -> bool:
-        """Return whether nothing tells on which side of a line the front axle's middle is."""
-        side, share = self._nearest_line()
-        unseen = presence[side] < SEEN and share < _NEAR_LINE
-        return share < _ASTRIDE or unseen or self._entered
+    def _knows_side(self, pair: Pair, presence: list[float]) -> bool:
+        """Return whether it is known on which side of a line the front axle's middle is."""
+        side, beside_cm = self._nearest_line()
+        beside = beside_cm / self.lane.likely_cm
+        self._which_lane.arrive(beside, _are_shown(pair, presence))
+        return not self._which_lane.is_a_guess(beside, presence[side] >= SEEN)
 
     def _beyond_a_crossed_line(self) -> list[_Start]:
         """Return where the lines of the next lane are expected, once the front axle has crossed one."""
@@ -440,9 +394,7 @@ class LaneTracker:
                 starts.append(_Start(*beyond, beyond=True))
         return starts
 
-    def _at_junction(
-        self, pair: tuple[_Candidate, _Candidate], presence: list[float], borders: RoadBorders
-    ) -> bool:
+    def _at_junction(self, pair: Pair, presence: list[float], borders: RoadBorders) -> bool:
         """Return whether the lines that the frame shows are not those of the lane, which goes straight on."""
         width_cm = self.lane.width_cm
         if self._last is None or width_cm is None:
@@ -462,7 +414,7 @@ class LaneTracker:
 
     def _turning(
         self,
-        pair: tuple[_Candidate, _Candidate],
+        pair: Pair,
         presence: list[float],
         width_cm: float,
         borders: RoadBorders,
@@ -484,7 +436,7 @@ class LaneTracker:
                 return False, side, presence[1 - side] < _ENDED
         return False, None, False
 
-    def _notice_change(self, pair: tuple[_Candidate, _Candidate]) -> None:
+    def _notice_change(self, pair: Pair) -> None:
         """Notice that one of the lane's lines was the other one before: the car is in the next lane."""
         width_cm = self.lane.width_cm
         if self._last is None or width_cm is None:
@@ -494,20 +446,15 @@ class LaneTracker:
             now_cm = pair[1 - side].points_cm[_MIDDLE]
             was_cm, crossed_cm = before_cm[1 - side], before_cm[side]
             if abs(now_cm - was_cm) > _CHANGED * width_cm and abs(now_cm - crossed_cm) < _SAME * width_cm:
-                self._entered = True
+                self._which_lane.enter()
                 self._width_here.reset()
                 self.looks.cross(side)
-                self._markings_cm[1 - side] = self._markings_cm[side]
-                self._markings_cm[side] = RollingMedian(_LENGTH)
+                self._markings.cross(side)
                 return
 
     def _to_measure(self, own: tuple[_Both, _Both], presence: list[float]) -> list[_Start]:
-        """Return the lines whose markings are measured in this frame: the network's own.
-
-        What was learned has no say: else a wrong belief would find itself confirmed in every frame.
-        """
-        known = all(self._usual_marking_cm(side) is not None for side in range(len(SIDES)))
-        if known and (self._frames + 1) % _MEASURED_EVERY:
+        """Return the lines whose markings are measured in this frame: the network's own."""
+        if not self._markings.next_frame():
             return []
         return [
             _Start(side, own[0][side], own[1][side], 0.0, None, measured=True)
@@ -515,27 +462,19 @@ class LaneTracker:
             if present >= _LEAST_PRESENCE
         ]
 
-    def _learn_markings(
-        self, pair: tuple[_Candidate, _Candidate], measured: Iterable[tuple[_Start, _Found]]
-    ) -> None:
+    def _learn_markings(self, pair: Pair, measured: Iterable[tuple[_Start, _Found]]) -> None:
         """Learn how wide the lane's markings are, and whether they are light, from what was measured."""
-        self._frames += 1
         for start, found in measured:
             both_cm = zip(found.points_cm, pair[start.side].points_cm, strict=True)
             off_cm = max(abs(x - chosen_x) for x, chosen_x in both_cm)
             if found.seen_cm >= _WIDTH_SEEN_CM and off_cm < _SAME * self.lane.likely_cm:
-                self._markings_cm[start.side].append(found.marking_cm)
-
-    def _usual_marking_cm(self, side: int) -> float | None:
-        """Return the width of a line's marking, negative if dark; None until enough frames showed it."""
-        widths_cm = self._markings_cm[side]
-        return widths_cm.median if len(widths_cm) >= _ENOUGH else None
+                self._markings.learn(start.side, found.marking_cm)
 
     def _refine(self, starts: Sequence[_Start], borders: RoadBorders) -> list[_Found]:
         """Refine lines; light and dark are tried until markings are known, and where they are measured."""
         asked, both = [], []
         for start in starts:
-            usual_cm = None if start.measured else self._usual_marking_cm(start.side)
+            usual_cm = None if start.measured else self._markings.usual_cm(start.side)
             unknown = usual_cm is None
             marking_cm = usual_cm or _MARKING_CM
             sigma_cm = _MARKING_SIGMA_CM if unknown else _KNOWN_SIGMA_CM
@@ -554,70 +493,14 @@ class LaneTracker:
             found.append(line)
         return found
 
-    def _best_pair(
-        self, candidates: tuple[list[_Candidate], list[_Candidate]]
-    ) -> tuple[tuple[_Candidate, _Candidate], float, bool]:
-        """Choose the left and the right line, and learn the width from what would be chosen without.
-
-        Returns:
-            The pair, its lines' distance, [cm], and whether clearly less speaks for those in the next lane.
-        """
-        lines_cm = np.array([line.points_cm for lines in candidates for line in lines])
-        lefts = len(candidates[0])
-        across_cm = distances_cm(lines_cm[:lefts], lines_cm[lefts:]).tolist()
-        least_cm = _NARROWEST * self.lane.likely_cm
-        pairs, scores, widths = [], [], []
-        for left, row in zip(candidates[0], across_cm, strict=True):
-            for right, width_cm in zip(candidates[1], row, strict=True):
-                if width_cm < least_cm:
-                    continue
-                score_cm = left.score_cm + right.score_cm
-                outside_cm = max(left.points_cm[0], -right.points_cm[0])
-                if outside_cm > 0.0:
-                    score_cm -= _BY_OUTSIDE_CM * min(outside_cm / _OUTSIDE_CM, 1.0)
-                pairs.append((left, right))
-                scores.append(score_cm)
-                widths.append(width_cm)
-        self._rival = None
-        if not pairs:
-            return (candidates[0][-1], candidates[1][-1]), math.nan, True
-        likely = self.lane.match(np.array(widths), _WIDTH_SIGMA).tolist()
-        best = scores.index(max(scores))
-        shown = pairs[best]
-        # A belief must not choose its own evidence: else a wrong one would never be unlearned.
-        if _is_plain(shown):
-            self.lane.learn(np.array(shown[0].points_cm + shown[1].points_cm), _CERTAIN)
-        scores = [score - _BY_WIDTH_CM * (1.0 - own) for score, own in zip(scores, likely, strict=True)]
-        if self._on_line():
-            both = [min(left.presence, right.presence) for left, right in pairs]
-            scores = [s + _BY_BOTH_CM * p * own for s, p, own in zip(scores, both, likely, strict=True)]
-        chosen = scores.index(max(scores))
-        least, next_cm = scores[chosen] - _UNDECIDED_CM, _NEXT_LANE * self.lane.likely_cm
-        middle_cm = _middle_cm(pairs[chosen])
-        rivals = [
-            i
-            for i, score in enumerate(scores)
-            if score >= least and abs(_middle_cm(pairs[i]) - middle_cm) > next_cm
-        ]
-        self._rival = pairs[max(rivals, key=scores.__getitem__)] if rivals else None
-        return pairs[chosen], widths[chosen], not rivals
-
 
 def _both(values: list[float]) -> _Both:
     return [values[: len(ROWS_CM)], values[len(ROWS_CM) :]]
 
 
-def _is_plain(pair: tuple[_Candidate, _Candidate]) -> bool:
-    """Return whether both lines tell the lane's width: they are seen, and the car is between them."""
-    left, right = pair
-    between = left.points_cm[0] <= 0.0 <= right.points_cm[0]
-    return between and all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SEEN for line in pair)
-
-
-def _middle_cm(pair: tuple[_Candidate, _Candidate]) -> float:
-    """Return x of the middle between two lines, 15 cm ahead."""
-    left, right = pair
-    return 0.5 * (left.points_cm[_MIDDLE] + right.points_cm[_MIDDLE])
+def _are_shown(pair: Pair, presence: list[float]) -> bool:
+    """Return whether the network and the edges show both lines."""
+    return all(line.seen_cm >= _WIDTH_SEEN_CM and p > SEEN for line, p in zip(pair, presence, strict=True))
 
 
 def _moved(sigma_cm: list[float]) -> list[float]:
@@ -625,7 +508,7 @@ def _moved(sigma_cm: list[float]) -> list[float]:
     return list(map(math.hypot, sigma_cm, _MOVED_CM))
 
 
-def _sigma_cm(line: _Candidate) -> list[float]:
+def _sigma_cm(line: Candidate) -> list[float]:
     """Return the sigmas of a line that is seen here and there, or not as far as the label rows."""
     sigma_cm = line.sigma_cm
     if 0.0 < line.seen_cm < _LINE_SEEN_CM:
@@ -633,28 +516,3 @@ def _sigma_cm(line: _Candidate) -> list[float]:
     if line.seen_cm > 0.0 and not line.seen_at[-1]:
         sigma_cm = [*sigma_cm[:-1], _AHEAD * sigma_cm[-1]]
     return sigma_cm
-
-
-#: y at which two lines are compared, beyond the label rows on both sides, and which lie between the rows.
-_COMPARED_CM = np.arange(-12.0, 49.0, 4.0)
-_BEGIN, _END = np.searchsorted(_COMPARED_CM, [ROWS_CM[0], ROWS_CM[-1] + 1e-9]).tolist()
-_AHEAD_CM2 = np.subtract.outer(_COMPARED_CM, _COMPARED_CM) ** 2
-
-
-def distances_cm(
-    lefts_cm: Float[np.ndarray, "l 3"], rights_cm: Float[np.ndarray, "r 3"]
-) -> Float[np.ndarray, "l r"]:
-    """Return the distance of each left line to each right one, across the lane: at corners as well.
-
-    The median distance of the points of one to the nearest of the other; negative where they are swapped.
-
-    Args:
-        lefts_cm: x at the label rows, frame car.
-        rights_cm: Likewise.
-    """
-    if compiled.is_here():
-        return compiled.distances(lefts_cm, rights_cm, BASIS, _COMPARED_CM, (_BEGIN, _END))
-    left, right = line_at(lefts_cm, _COMPARED_CM)[0], line_at(rights_cm, _COMPARED_CM)[0]
-    squares = (right[None, :, None, :] - left[:, None, :, None]) ** 2 + _AHEAD_CM2
-    nearest = np.concatenate([squares.min(axis=axis)[..., _BEGIN:_END] for axis in (3, 2)], axis=2)
-    return np.sqrt(np.median(nearest, axis=2)) * np.sign(rights_cm[None, :, 1] - lefts_cm[:, None, 1])

@@ -1,0 +1,1 @@
+"""The lane from frame to frame, on the network's lines and the edges that confirm them."""
