@@ -347,13 +347,23 @@ def test_a_lost_lane_is_found_again_with_both_of_its_lines(frames, sides, answer
     assert np.isfinite(points_cm).sum() == np.isfinite(sigma_cm).sum() == answered
 
 
+@pytest.mark.parametrize(("presence", "answered"), [((0.4, 0.4), False), ((0.6, 0.4), True)])
+def test_without_a_line_that_the_network_sees_nothing_is_answered(presence, answered):
+    lane = np.repeat([-20.0, 20.0], 3)
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    tracker.follow(lane, SURE, SEEN, edges_of(lane))
+    points_cm, _, _ = tracker.follow(lane, SURE, np.array(presence), edges_of(lane))
+    assert np.isfinite(points_cm).all() == answered
+
+
 def test_a_lane_is_lost_where_nothing_of_it_is_known():
     tracker = LaneTracker(LaneMemory(LANE_CM))
-    lane, unsure = np.repeat([-20.0, 20.0], 3), np.full(6, 9.0)
+    lane = np.repeat([-20.0, 20.0], 3)
     nothing = RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
     tracker.follow(lane, SURE, SEEN, edges_of(lane))
-    known = [np.isfinite(tracker.follow(lane, unsure, 0.1 * SEEN, nothing)[0]).any() for _ in range(16)]
-    assert known[0] and not any(known[-3:])
+    for _ in range(3):
+        points_cm, _, _ = tracker.follow(lane, SURE, 0.1 * SEEN, nothing)
+        assert np.isnan(points_cm).all()
     points_cm, _, _ = tracker.follow(lane, SURE, np.array([0.0, 1.0]), edges_of(lane, sides=(1,)))
     assert np.isnan(points_cm).all()
 

@@ -217,7 +217,8 @@ class LaneTracker:
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
                 found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = math.inf
         self._doubt_beyond_corners(pair, present, borders, found_sigma_cm)
-        if not decided or not self._knows_side(pair, present):
+        # Without a line that the network sees, what the edges go on showing may be anything.
+        if not decided or max(present) < SEEN or not self._knows_side(pair, present):
             found_sigma_cm = [math.inf] * len(found_cm)
         known_cm, known_sigma_cm = self._known(found_cm, found_sigma_cm, network_cm)
         if np.isnan(known_cm).all():
