@@ -54,10 +54,10 @@ PyObject* learn(PyObject*, PyObject* args) {
     // Where the share is lost in rounding, which is so for most widths, the logarithm is known.
     const double likely = share < kLost * others ? log_others : std::log(share + others);
     const double told = kept * (nats.as<double>()[i] - prior.as<double>()[i]) + likely / alike;
-    nats.as<double>()[i] = prior.as<double>()[i] + told;
+    nats.into<double>()[i] = prior.as<double>()[i] + told;
   }
   double mean, variance;
-  settle(nats.as<double>(), logs.as<double>(), n, probability.as<double>(), &mean, &variance);
+  settle(nats.into<double>(), logs.as<double>(), n, probability.into<double>(), &mean, &variance);
   return Py_BuildValue("dd", mean, variance);
 }
 

@@ -12,12 +12,17 @@ struct Buffer {
   Py_buffer view{};
   ~Buffer() { PyBuffer_Release(&view); }
   template <class T>
-  T* as() const {
+  const T* as() const {
+    return static_cast<const T*>(view.buf);
+  }
+  // Of an argument that is written to.
+  template <class T>
+  T* into() const {
     return static_cast<T*>(view.buf);
   }
   template <class T>
-  std::size_t size() const {
-    return view.len / sizeof(T);
+  Py_ssize_t size() const {
+    return view.len / Py_ssize_t{sizeof(T)};
   }
   template <class T>
   bool holds(std::size_t count) const {

@@ -611,7 +611,7 @@ struct Search {
     if (keep.view.buf && !keep.holds<uint8_t>(size)) return "keep: not of the frame's size";
     const int64_t* at = sample.as<int64_t>();
     bool beyond = false;
-    for (size_t i = 0; i < sample.size<int64_t>(); ++i) beyond |= static_cast<uint64_t>(at[i]) >= size;
+    for (Py_ssize_t i = 0; i < sample.size<int64_t>(); ++i) beyond |= static_cast<uint64_t>(at[i]) >= size;
     return beyond ? "sample: beyond the frame" : nullptr;
   }
 
@@ -694,7 +694,7 @@ PyObject* extract(PyObject*, PyObject* args) {
                         &search.clear, &table.view, &first, &rows))
     return nullptr;
   if (const char* fault = search.fault()) return refuse(fault);
-  if (rows < 1 || !table.holds<double>(6 * rows * search.width)) return refuse("table: not of this size");
+  if (rows < 1 || !table.holds<double>(size_t{6} * rows * search.width)) return refuse("table: not of this size");
   try {
     Scratch& s = scratch();
     search.run(s);
@@ -750,7 +750,7 @@ PyObject* lift(PyObject*, PyObject* args) {
   const size_t n = uv.view.len / (2 * sizeof(double));
   if (!normals.holds<uint8_t>(uv.view.len) || (hues.view.buf && !hues.holds<uint8_t>(uv.view.len)))
     return refuse("edges: positions, normals and hues differ in number");
-  if (height < 1 || width < 1 || !table.holds<double>(6 * height * width))
+  if (height < 1 || width < 1 || !table.holds<double>(size_t{6} * height * width))
     return refuse("table: not of this size");
   return single ? lifted<float>(n, uv, normals, hues, table, height, width, true)
                 : lifted<double>(n, uv, normals, hues, table, height, width, false);
@@ -772,7 +772,7 @@ PyObject* raster(PyObject*, PyObject* args) {
     using T = decltype(type);
     mark_cells<T>(points.view.len / (2 * sizeof(T)), points.as<T>(), normals.as<T>(), hues.as<T>(),
                   T(left_cm), T(far_cm), T(cell_cm), rows, columns, planes, middle, T(steps),
-                  out.as<uint8_t>());
+                  out.into<uint8_t>());
   };
   if (single) fill(float{});
   else fill(double{});

@@ -28,10 +28,12 @@ def loops_of(package: str) -> ModuleType | None:
     except ImportError:
         return None
     built = Path(str(module.__file__))
-    source = built.with_name("_kernels.cpp")
-    if source.exists() and source.stat().st_mtime > built.stat().st_mtime:
-        log.warning("%s is newer than what was built of it: slower until `make install` builds it", source)
-        return None
+    for source in (built.with_name("_kernels.cpp"), Path(__file__).parents[1] / "arguments.hpp"):
+        if source.exists() and source.stat().st_mtime > built.stat().st_mtime:
+            log.warning(
+                "%s is newer than what was built of it: slower until `make install` builds it", source
+            )
+            return None
     return module
 
 

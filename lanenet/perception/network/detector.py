@@ -107,8 +107,8 @@ class NetworkDetector:
         """Find the lane in one frame.
 
         Returns:
-            All six points with their standard deviations; an empty estimate of confidence 0 if no edge lies
-            in the window, or if the frame is all edges.
+            The six points with their standard deviations, NaN where unknown; an empty estimate of confidence
+            0 if no edge lies in the window, or if the frame is all edges.
 
         Raises:
             CalibrationError: If the frame's size is not the camera's.

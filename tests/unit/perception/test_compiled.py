@@ -149,6 +149,9 @@ def test_memory_beyond_the_arguments_is_not_read():
     ):
         with pytest.raises(ValueError, match=r"differ|not of"):
             compiled._kernels.lift(*arguments, 4, 5, False)
+    # Rows times columns times six, that of the table in 32 bits.
+    with pytest.raises(ValueError, match="not of"):
+        compiled._kernels.lift(points, points, None, table, 4, 5 + 2**29, False)
     place = (0.0, 10.0, 1.0, 4, 5)
     for arguments in (
         (points, points[:1], None, frame),

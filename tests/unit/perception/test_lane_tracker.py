@@ -347,6 +347,17 @@ def test_a_lost_lane_is_found_again_with_both_of_its_lines(frames, sides, answer
     assert np.isfinite(points_cm).sum() == np.isfinite(sigma_cm).sum() == answered
 
 
+def test_a_car_between_two_lanes_has_not_lost_them():
+    tracker = LaneTracker(LaneMemory(LANE_CM))
+    for x_cm in (9.0, 4.0, *[0.5] * 4):
+        lines = np.repeat([x_cm - LANE_CM, x_cm], 3)
+        points_cm, _, _ = tracker.follow(lines, SURE, SEEN, edges_of(lines, sides=(1,)))
+    assert np.isnan(points_cm).all()
+    lines = np.repeat([4.0 - LANE_CM, 4.0], 3)
+    points_cm, _, _ = tracker.follow(lines, SURE, np.array([0.0, 1.0]), edges_of(lines, sides=(1,)))
+    assert np.isfinite(points_cm).any()
+
+
 @pytest.mark.parametrize(("presence", "answered"), [((0.4, 0.4), False), ((0.6, 0.4), True)])
 def test_without_a_line_that_the_network_sees_nothing_is_answered(presence, answered):
     lane = np.repeat([-20.0, 20.0], 3)

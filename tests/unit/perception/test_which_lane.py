@@ -11,29 +11,46 @@ FAR = 0.5
 
 def lost(frames: int) -> WhichLane:
     which = WhichLane()
-    assert which.is_found(shown=True)
+    assert which.find(shown=True)
     for _ in range(frames):
-        which.lose()
+        which.keep(known=False)
     return which
 
 
 def test_a_lane_that_was_out_of_sight_for_a_moment_is_the_same():
-    assert lost(2).is_found(shown=False)
+    assert lost(2).find(shown=False)
 
 
 def test_a_lane_that_was_lost_is_found_with_both_of_its_lines():
     which = lost(3)
-    assert [which.is_found(shown) for shown in (False, False, True, False)] == [False, False, True, True]
+    assert [which.find(shown) for shown in (False, False, True, False)] == [False, False, True, True]
 
 
 def test_a_single_line_that_stays_in_sight_is_the_lanes_in_the_end():
     which = lost(3)
-    found = [which.is_found(shown=False) for _ in range(14)]
-    assert found == [False] * 11 + [True] * 3
+    assert [which.find(shown=False) for _ in range(14)] == [False] * 12 + [True] * 2
 
 
-def test_a_lane_that_was_never_seen_is_not_lost():
-    assert WhichLane().is_found(shown=False)
+def test_frames_without_a_lane_count_while_it_is_looked_for_and_do_not_begin_it_anew():
+    which = lost(3)
+    assert not which.find(shown=False)
+    for _ in range(8):
+        which.keep(known=False)
+    assert [which.find(shown=False) for _ in range(5)] == [False] * 3 + [True] * 2
+
+
+def test_a_lane_that_was_never_known_is_not_lost():
+    which = WhichLane()
+    for _ in range(5):
+        which.keep(known=False)
+    assert which.find(shown=False)
+
+
+def test_a_lane_that_is_known_without_its_lines_is_not_lost():
+    which = lost(2)
+    which.keep(known=True)
+    which.keep(known=False)
+    assert which.find(shown=False)
 
 
 @pytest.mark.parametrize(
@@ -60,4 +77,4 @@ def test_reset_forgets():
     which = lost(5)
     which.enter()
     which.reset()
-    assert which.is_found(shown=False) and not which.is_a_guess(FAR, seen=True)
+    assert which.find(shown=False) and not which.is_a_guess(FAR, seen=True)

@@ -47,8 +47,8 @@ _BY_PRESENCE_CM, _BY_CONTINUING_CM = 6.0, 3.0
 #: half of the 46 cm that count.
 _BEYOND_SEEN_CM = 26.0
 _MIDDLE = 1
-#: Sigma that is added to a line seen over less than the length above: on nine drives such lines lay 2 to 4 cm
-#: off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
+#: Sigma that is added to a line seen over less than ``_LINE_SEEN_CM``: on nine drives such lines lay 2 to
+#: 4 cm off. Factor on sigma beyond the last border ahead, where tape may turn: 1 to 3 were tried.
 _BARELY_CM, _AHEAD = 2.0, 3.0
 #: A point is unknown if the sigma of its line is above this share of the lane's width, or of the likely one.
 #: What lies between a line and the network's own answer, 15 cm ahead and at the point itself, counts with it:
@@ -194,7 +194,9 @@ class LaneTracker:
             continued_cm, continued_sigma_cm = (x.ravel().tolist() for x in self.straight_on.lane())
             self._last = _both(continued_cm), _both(continued_sigma_cm)
             self._width_here.look(None)
-            return (*self._known(continued_cm, continued_sigma_cm, continued_cm), np.zeros(len(SIDES)))
+            known_cm, known_sigma_cm = self._known(continued_cm, continued_sigma_cm, continued_cm)
+            self._which_lane.keep(not np.isnan(known_cm).all())
+            return known_cm, known_sigma_cm, np.zeros(len(SIDES))
         self._notice_change(pair)
         self._width_here.look(across_cm if decided and tells_width(pair) else None)
         self._learn_markings(pair, zip(measured, measures, strict=True))
@@ -217,19 +219,27 @@ class LaneTracker:
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
                 found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = math.inf
         self._doubt_beyond_corners(pair, present, borders, found_sigma_cm)
+        shown, guessed = _are_shown(pair, present), False
+        if decided:
+            side, beside_cm = self._nearest_line()
+            beside = beside_cm / self.lane.likely_cm
+            self._which_lane.arrive(beside, shown)
+            guessed = self._which_lane.is_a_guess(beside, present[side] >= SEEN)
         # Without a line that the network sees, what the edges go on showing may be anything.
-        if not decided or max(present) < SEEN or not self._knows_side(pair, present):
+        if not decided or guessed or max(present) < SEEN:
             found_sigma_cm = [math.inf] * len(found_cm)
         known_cm, known_sigma_cm = self._known(found_cm, found_sigma_cm, network_cm)
         if np.isnan(known_cm).all():
-            self.lose()
-        elif not self._which_lane.is_found(_are_shown(pair, present)):
+            # A car between two lanes has not lost them.
+            if decided and not guessed:
+                self.lose()
+        elif not self._which_lane.find(shown):
             known_cm[:] = known_sigma_cm[:] = math.nan
         return known_cm, known_sigma_cm, np.array([left.seen_cm, right.seen_cm])
 
     def lose(self) -> None:
         """Take a frame that shows nothing of the lane."""
-        self._which_lane.lose()
+        self._which_lane.keep(False)
 
     def _tell_other(
         self,
@@ -367,13 +377,6 @@ class LaneTracker:
         beside_cm = [abs(line_cm[0]) for line_cm in self._last[0]]
         side = beside_cm.index(min(beside_cm))
         return side, beside_cm[side]
-
-    def _knows_side(self, pair: Pair, presence: list[float]) -> bool:
-        """Return whether it is known on which side of a line the front axle's middle is."""
-        side, beside_cm = self._nearest_line()
-        beside = beside_cm / self.lane.likely_cm
-        self._which_lane.arrive(beside, _are_shown(pair, presence))
-        return not self._which_lane.is_a_guess(beside, presence[side] >= SEEN)
 
     def _beyond_a_crossed_line(self) -> list[_Start]:
         """Return where the lines of the next lane are expected, once the front axle has crossed one."""

@@ -15,11 +15,11 @@ _ASTRIDE = 0.02
 #: 1.46 cm. Tried: 0.15, 0.2 and 0.3 gave 1.43, 1.32 and 1.30 cm, 96.4, 96.3 and 96.0 %. After a crossing at
 #: any distance: 0.3 % fewer points, the same RMSE.
 _NEAR_LINE = 0.25
-#: After so many frames in which nothing was known a lane counts as lost; it is found again when both of its
-#: lines are shown, or after so many frames more. Of 35 times that a lane was lost on 216 simulated drives of
-#: nine seeds, eight went on in another one: 0.6 % of the points, and 27 % of the squared errors. The RMSE
-#: is 1.12 instead of 1.30 cm for it, and on `garage_tape`, which had no say, 1.01 instead of 1.16. Tried:
-#: after 2 frames 1.12 and 0.94 cm, 0.4 % fewer points; found after 6 or 25 frames more, 1.19 and 1.12 cm.
+#: After so many frames in a row in which nothing was known of it a lane counts as lost; what is known
+#: afterwards is the car's lane when both of its lines are shown, or after so many frames more. Of 35 times
+#: that a lane was found again beside a single line on 216 simulated drives of nine seeds, eight were in
+#: another one: 0.6 % of the points, and 27 % of the squared errors. Tried: lost after 2 frames, found after
+#: 6, 8 or 25 more; see docs/learning.md.
 _LOST_FRAMES, _SOUGHT_FRAMES = 3, 12
 
 
@@ -32,7 +32,7 @@ class WhichLane:
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
-        self._entered = False
+        self._entered = self._was_known = False
         self._unknown = self._sought = 0
 
     def enter(self) -> None:
@@ -58,18 +58,26 @@ class WhichLane:
         """
         return self._entered or beside < _ASTRIDE or (beside < _NEAR_LINE and not seen)
 
-    def lose(self) -> None:
-        """A frame in which nothing is known of the lane."""
-        self._unknown += 1
+    def keep(self, known: bool) -> None:
+        """Take a frame in which the lane is known without its lines, or in which nothing is known.
 
-    def is_found(self, shown: bool) -> bool:
-        """Return whether what a frame shows is the lane again, after frames that showed none.
+        A lane that was never known is not lost.
+        """
+        self._was_known |= known
+        self._unknown = 0 if known else self._unknown + self._was_known
+        self._sought = max(0, self._sought - 1)
+
+    def find(self, shown: bool) -> bool:
+        """Take a frame in which a lane is known; return whether it is the car's, also after it was lost.
 
         Args:
             shown: As above.
         """
-        if self._unknown >= _LOST_FRAMES:
+        if self._unknown >= _LOST_FRAMES and not self._sought:
             self._sought = _SOUGHT_FRAMES
-        self._unknown = 0
-        self._sought = 0 if shown else max(0, self._sought - 1)
+        else:
+            self._sought = max(0, self._sought - 1)
+        if shown:
+            self._sought = 0
+        self._unknown, self._was_known = 0, True
         return self._sought == 0
