@@ -358,12 +358,15 @@ def test_a_car_between_two_lanes_has_not_lost_them():
     assert np.isfinite(points_cm).any()
 
 
-@pytest.mark.parametrize(("presence", "answered"), [((0.4, 0.4), False), ((0.6, 0.4), True)])
-def test_without_a_line_that_the_network_sees_nothing_is_answered(presence, answered):
+@pytest.mark.parametrize(
+    ("presence", "sides", "answered"),
+    [((0.4, 0.4), (1,), False), ((0.4, 0.6), (1,), True), ((0.4, 0.4), (0, 1), True)],
+)
+def test_a_line_that_the_network_does_not_see_is_none_by_itself(presence, sides, answered):
     lane = np.repeat([-20.0, 20.0], 3)
     tracker = LaneTracker(LaneMemory(LANE_CM))
     tracker.follow(lane, SURE, SEEN, edges_of(lane))
-    points_cm, _, _ = tracker.follow(lane, SURE, np.array(presence), edges_of(lane))
+    points_cm, _, _ = tracker.follow(lane, SURE, np.array(presence), edges_of(lane, sides=sides))
     assert np.isfinite(points_cm).all() == answered
 
 

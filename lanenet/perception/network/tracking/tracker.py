@@ -225,8 +225,9 @@ class LaneTracker:
             beside = beside_cm / self.lane.likely_cm
             self._which_lane.arrive(beside, shown)
             guessed = self._which_lane.is_a_guess(beside, present[side] >= SEEN)
-        # Without a line that the network sees, what the edges go on showing may be anything.
-        if not decided or guessed or max(present) < SEEN:
+        # What edges show of one line may be anything, if the network sees neither.
+        unseen = max(present) < SEEN and min(left.seen_cm, right.seen_cm) < _WIDTH_SEEN_CM
+        if not decided or guessed or unseen:
             found_sigma_cm = [math.inf] * len(found_cm)
         known_cm, known_sigma_cm = self._known(found_cm, found_sigma_cm, network_cm)
         if np.isnan(known_cm).all():
