@@ -219,14 +219,14 @@ class LaneTracker:
             if line.seen_cm >= _LINE_SEEN_CM and not line.seen_at[-1] and self.looks.is_solid(side):
                 found_sigma_cm[len(ROWS_CM) * (side + 1) - 1] = math.inf
         self._doubt_beyond_corners(pair, present, borders, found_sigma_cm)
-        shown, guessed = _are_shown(pair, present), False
+        on_edges, guessed = min(left.seen_cm, right.seen_cm) >= _WIDTH_SEEN_CM, False
         if decided:
             side, beside_cm = self._nearest_line()
             beside = beside_cm / self.lane.likely_cm
-            self._which_lane.arrive(beside, shown)
+            self._which_lane.arrive(beside, on_edges and min(present) > SEEN)
             guessed = self._which_lane.is_a_guess(beside, present[side] >= SEEN)
         # What edges show of one line may be anything, if the network sees neither.
-        unseen = max(present) < SEEN and min(left.seen_cm, right.seen_cm) < _WIDTH_SEEN_CM
+        unseen = max(present) < SEEN and not on_edges
         if not decided or guessed or unseen:
             found_sigma_cm = [math.inf] * len(found_cm)
         known_cm, known_sigma_cm = self._known(found_cm, found_sigma_cm, network_cm)
@@ -234,7 +234,7 @@ class LaneTracker:
             # A car between two lanes has not lost them.
             if decided and not guessed:
                 self.lose()
-        elif not self._which_lane.find(shown):
+        elif not self._which_lane.find(on_edges):
             known_cm[:] = known_sigma_cm[:] = math.nan
         return known_cm, known_sigma_cm, np.array([left.seen_cm, right.seen_cm])
 
@@ -501,11 +501,6 @@ class LaneTracker:
 
 def _both(values: list[float]) -> _Both:
     return [values[: len(ROWS_CM)], values[len(ROWS_CM) :]]
-
-
-def _are_shown(pair: Pair, presence: list[float]) -> bool:
-    """Return whether the network and the edges show both lines."""
-    return all(line.seen_cm >= _WIDTH_SEEN_CM and p > SEEN for line, p in zip(pair, presence, strict=True))
 
 
 def _moved(sigma_cm: list[float]) -> list[float]:

@@ -71,7 +71,8 @@ class WhichLane:
         """Take a frame in which a lane is known; return whether it is the car's, also after it was lost.
 
         Args:
-            shown: As above.
+            shown: Whether the edges show both of its lines, whatever the network sees of them: one that was
+                trained with another camera sees less.
         """
         if self._unknown >= _LOST_FRAMES and not self._sought:
             self._sought = _SOUGHT_FRAMES
