@@ -142,7 +142,16 @@ def borders_of(lines_cm: dict[int, np.ndarray]) -> RoadEdges:
     return RoadEdges(np.concatenate(points), np.concatenate(normals))
 
 
-def drive_into_a_side_road(goes_on: bool) -> tuple[LaneTracker, np.ndarray]:
+def with_a_speck(edges: RoadEdges) -> RoadEdges:
+    """Add a reflection like a piece of tape that leans to the right, where the left line has ended."""
+    y = np.arange(14.0, 31.0, 0.5)
+    x = -13.0 + 0.2 * (y - 14.0)
+    points = [np.stack([x + 1.5 * side, y], axis=1) for side in (-1.0, 1.0)]
+    normals = [np.tile([-side, 0.0], (len(y), 1)) for side in (-1.0, 1.0)]
+    return RoadEdges(np.concatenate([edges.points_cm, *points]), np.concatenate([edges.normals, *normals]))
+
+
+def drive_into_a_side_road(goes_on: bool, speck: bool = False) -> tuple[LaneTracker, np.ndarray]:
     """The right line turns away 20 cm ahead; the left one goes on in parallel, or has ended."""
     tracker = LaneTracker(LaneMemory(WIDTH_CM), view=CameraView(example_camera()))
     y = np.arange(-5.0, 46.0, 1.0)
@@ -167,12 +176,14 @@ def drive_into_a_side_road(goes_on: bool) -> tuple[LaneTracker, np.ndarray]:
             [np.interp([0, 15, 30], y, -20.0 + bend(radius_cm + 20.0)), np.interp([0, 15, 30], y, right)]
         )
         presence = np.array([1.0 if goes_on else 0.1, 1.0])
-        found_cm = tracker.follow(guess, sigma_cm, presence, borders_of(lines))[0]
+        edges = with_a_speck(borders_of(lines)) if speck else borders_of(lines)
+        found_cm = tracker.follow(guess, sigma_cm, presence, edges)[0]
     return tracker, found_cm
 
 
-def test_the_tracker_goes_straight_on_where_one_line_leaves_and_the_other_has_ended():
-    tracker, found_cm = drive_into_a_side_road(goes_on=False)
+@pytest.mark.parametrize("speck", [False, True])
+def test_the_tracker_goes_straight_on_where_one_line_leaves_and_the_other_has_ended(speck):
+    tracker, found_cm = drive_into_a_side_road(goes_on=False, speck=speck)
     assert tracker.straight_on.on
     assert found_cm == pytest.approx(LANE.reshape(6), abs=1.0)
 
@@ -181,3 +192,13 @@ def test_the_tracker_follows_a_bend():
     tracker, found_cm = drive_into_a_side_road(goes_on=True)
     assert not tracker.straight_on.on
     assert found_cm[4] > 22.0
+
+
+def test_a_speck_beside_a_line_that_turns_away_is_not_the_lanes_other_line():
+    lane = StraightOn()
+    speck = [-17.0, -11.0, -8.0]
+    assert not lane.is_a_speck(speck, 10.0, 0, WIDTH_CM), "no lane is known yet"
+    lane.look(seen(LANE), leaving=None, ended=False, width_cm=WIDTH_CM)
+    assert lane.is_a_speck(speck, 10.0, 0, WIDTH_CM)
+    assert not lane.is_a_speck(speck, 25.0, 0, WIDTH_CM), "as long as a line"
+    assert not lane.is_a_speck([-19.0, -18.0, -16.0], 10.0, 0, WIDTH_CM), "where the line would be"

@@ -437,7 +437,8 @@ class LaneTracker:
             off_cm = np.abs(found.points_cm - beside_cm).max()
             if found.seen_at[-1] and found.seen_cm >= _WIDTH_SEEN_CM and off_cm < _BESIDE * width_cm:
                 return True, None, False
-            if not other.seen_at[-1] or other.seen_cm < _LINE_SEEN_CM:
+            speck = self.straight_on.is_a_speck(other.points_cm, other.seen_cm, 1 - side, width_cm)
+            if not other.seen_at[-1] or other.seen_cm < _LINE_SEEN_CM or speck:
                 return False, side, presence[1 - side] < _ENDED
         return False, None, False
 
