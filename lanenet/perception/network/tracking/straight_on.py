@@ -30,13 +30,13 @@ _PLAIN_CM, _PLAIN_WIDTH, _PLAIN_TURN, _FRESH, _FRESH_UNTOLD = 9.0, 0.12, 0.12, 2
 #: A line is the lane's again if it is seen in this length, [cm], and if it is within this share of the width
 #: of where it is expected, and turns away by less than this one. Chosen.
 _SEEN_CM, _SAME, _STRAIGHT = 12.0, 0.12, 0.08
+#: Two lines are, if their distance is between these shares of the width, and their middle not further from
+#: the expected one than this. Chosen.
+_NARROW, _WIDE, _BESIDE = 0.8, 1.25, 0.35
 #: A line beside one that turns away, where it is not expected, counts if it is seen over this length, [cm].
 #: Tried: 12, 16 and 20 pass two, three and three of three mouths of side roads in glare; with no limit, 0.6 %
 #: of the points of `garage_tape` are lost.
 _SPECK_CM = 20.0
-#: Two lines are, if their distance is between these shares of the width, and their middle not further from
-#: the expected one than this. Chosen.
-_NARROW, _WIDE, _BESIDE = 0.8, 1.25, 0.35
 #: Sigma of the continued lane beside the car, and per cm ahead and driven since. Chosen: 1.5 degrees.
 _PLACE_CM, _DIRECTION_RAD = 1.0, 0.026
 #: The same while nobody tells how the car moves: more than what counts as known.
