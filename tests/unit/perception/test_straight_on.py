@@ -11,25 +11,29 @@ from lanenet.perception.estimate import LaneMemory
 from lanenet.perception.network.tracking.camera_view import CameraView
 from lanenet.perception.network.tracking.straight_on import SeenLines, StraightOn, turns_away_cm
 from lanenet.perception.network.tracking.tracker import LaneTracker
+from tests.unit.perception.tapes import tape, together
 
 WIDTH_CM, WHEELBASE_CM = 40.0, 17.0
 LANE = np.array([[-20.0, -20.0, -20.0], [20.0, 20.0, 20.0]])
 #: The right line turns into a side road, and the left one has ended.
 SIDE_ROAD = np.array([[-20.0, -18.0, -14.0], [20.0, 24.0, 42.0]])
+#: What the network may say of the two lines.
+BOTH, RIGHT = (1.0, 1.0), (0.1, 1.0)
 
 
-def seen(points_cm: np.ndarray, left: bool = True) -> SeenLines:
-    return SeenLines(points_cm.tolist(), [30.0 * left, 30.0], [[left] * 3, [True] * 3])
+def seen(points_cm: np.ndarray, left_cm: float = 30.0, right_cm: float = 30.0) -> SeenLines:
+    at = [[length_cm > 0.0] * 3 for length_cm in (left_cm, right_cm)]
+    return SeenLines(points_cm.tolist(), [left_cm, right_cm], at)
 
 
 def at_a_junction(told: bool = True) -> StraightOn:
     lane = StraightOn()
     if told:
         lane.moved(0.0, 0.0, WHEELBASE_CM)
-    lane.look(seen(LANE), leaving=None, ended=False, width_cm=WIDTH_CM)
+    lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
     for _ in range(2):
         assert not lane.on
-        lane.look(seen(SIDE_ROAD, left=False), leaving=1, ended=True, width_cm=WIDTH_CM)
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
     assert lane.on
     return lane
 
@@ -43,28 +47,64 @@ def test_without_the_cars_motion_its_place_is_unknown():
     assert at_a_junction(told=False).lane()[1].min() > 0.1 * WIDTH_CM
 
 
-def test_a_bend_in_which_the_other_line_goes_on_is_no_junction():
+def in_a_lane() -> StraightOn:
     lane = StraightOn()
-    lane.look(seen(LANE), leaving=None, ended=False, width_cm=WIDTH_CM)
+    lane.moved(0.0, 0.0, WHEELBASE_CM)
+    lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    return lane
+
+
+@pytest.mark.parametrize("left_cm", [12.0, 9.0])
+def test_a_bend_in_which_the_other_line_goes_on_is_no_junction(left_cm):
+    lane = in_a_lane()
     for _ in range(10):
-        lane.look(seen(SIDE_ROAD, left=False), leaving=1, ended=False, width_cm=WIDTH_CM)
+        lane.look(seen(SIDE_ROAD, left_cm), leaving=1, presence=BOTH, width_cm=WIDTH_CM)
     assert not lane.on
+
+
+def test_a_line_that_turns_away_for_long_beside_one_that_is_hardly_seen_is_a_junction():
+    lane = in_a_lane()
+    for frame in range(5):
+        assert not lane.on, frame
+        lane.look(seen(SIDE_ROAD, 6.0), leaving=1, presence=BOTH, width_cm=WIDTH_CM)
+    assert lane.on
+
+
+@pytest.mark.parametrize("between", [1, 5, 6])
+def test_that_a_line_turned_away_is_remembered_until_the_other_one_has_ended(between):
+    lane = in_a_lane()
+    lane.look(seen(SIDE_ROAD, 12.0), leaving=1, presence=BOTH, width_cm=WIDTH_CM)
+    for _ in range(between - 1):
+        lane.look(seen(SIDE_ROAD, 12.0, 6.0), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    for _ in range(2):
+        lane.look(seen(SIDE_ROAD, 6.0, 6.0), leaving=None, presence=RIGHT, width_cm=WIDTH_CM)
+    assert lane.on == (between < 6)
+    assert not lane.on or lane.leaving == 1
+
+
+def test_a_suspicion_outlasts_frames_that_show_nothing_but_not_those_that_show_the_lane():
+    for between, on in ((seen(SIDE_ROAD, 0.0, 0.0), True), (seen(LANE), False)):
+        lane = in_a_lane()
+        lane.look(seen(SIDE_ROAD, 0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+        lane.look(between, leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+        lane.look(seen(SIDE_ROAD, 0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+        assert lane.on == on
 
 
 def test_a_lane_that_was_plain_long_ago_is_not_continued():
     lane = StraightOn()
-    lane.look(seen(LANE), leaving=None, ended=False, width_cm=WIDTH_CM)
+    lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
     for _ in range(30):
-        lane.look(seen(SIDE_ROAD, left=False), leaving=None, ended=False, width_cm=WIDTH_CM)
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
     for _ in range(5):
-        lane.look(seen(SIDE_ROAD, left=False), leaving=1, ended=True, width_cm=WIDTH_CM)
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
     assert not lane.on
 
 
 def test_points_of_the_line_that_leaves_are_doubted_at_once():
     lane = StraightOn()
-    lane.look(seen(LANE), leaving=None, ended=False, width_cm=WIDTH_CM)
-    lane.look(seen(SIDE_ROAD, left=False), leaving=1, ended=False, width_cm=WIDTH_CM)
+    lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=BOTH, width_cm=WIDTH_CM)
     doubts = lane.doubts(SIDE_ROAD.reshape(6), WIDTH_CM)
     assert doubts.tolist() == [False, False, True, False, True, True]
 
@@ -100,11 +140,40 @@ def test_its_place_is_less_sure_after_reversing():
     assert (lane.lane()[1] > before_cm).all()
 
 
+def ahead(beside_cm: float, *y_cm: float) -> np.ndarray:
+    """The middle of a lane that is straight there."""
+    return np.stack([np.full(len(y_cm), beside_cm), y_cm], axis=1)
+
+
+def test_it_turns_to_where_the_lane_is_seen_ahead():
+    lane = at_a_junction()
+    lane.moved(50.0, 0.0, WHEELBASE_CM)
+    before_cm = lane.lane()[1]
+    lane.anchor(ahead(8.0, 75.0), WIDTH_CM)
+    points_cm, sigma_cm = lane.lane()
+    middle_cm = points_cm.mean(axis=0)
+    slope = (middle_cm[2] - middle_cm[0]) / 30.0
+    assert middle_cm[0] + 75.0 * slope == pytest.approx(8.0, abs=0.5)
+    assert 0.0 < middle_cm[0] < 3.0, "beside the car it is where it was, nearly"
+    assert points_cm[1] - points_cm[0] == pytest.approx(np.full(3, WIDTH_CM * math.hypot(1.0, slope)))
+    assert (sigma_cm < before_cm).all()
+
+
+def test_the_more_of_it_is_seen_ahead_the_less_counts_the_way_to_there():
+    beside_cm = []
+    for y_cm in ([75.0], [45.0, 60.0, 75.0]):
+        lane = at_a_junction()
+        lane.moved(80.0, 0.0, WHEELBASE_CM)
+        lane.anchor(ahead(8.0, *y_cm), WIDTH_CM)
+        beside_cm.append(lane.lane()[0].mean(axis=0)[0])
+    assert 0.0 < beside_cm[0] < 4.0 < beside_cm[1] < 8.0
+
+
 def test_it_ends_when_one_line_is_where_it_is_expected():
     lane = at_a_junction()
-    lane.look_for_its_end(seen(SIDE_ROAD, left=False), found=False, width_cm=WIDTH_CM)
+    lane.look_for_its_end(seen(SIDE_ROAD, left_cm=0.0), found=False, width_cm=WIDTH_CM)
     assert lane.on
-    lane.look_for_its_end(seen(LANE + 1.0, left=False), found=False, width_cm=WIDTH_CM)
+    lane.look_for_its_end(seen(LANE + 1.0, left_cm=0.0), found=False, width_cm=WIDTH_CM)
     assert not lane.on
 
 
@@ -119,7 +188,7 @@ def test_it_ends_when_a_lane_is_seen_beside():
 def test_it_ends_after_two_metres():
     lane = at_a_junction()
     lane.moved(200.0, 0.0, WHEELBASE_CM)
-    lane.look_for_its_end(seen(SIDE_ROAD, left=False), found=False, width_cm=WIDTH_CM)
+    lane.look_for_its_end(seen(SIDE_ROAD, left_cm=0.0), found=False, width_cm=WIDTH_CM)
     assert not lane.on
 
 
@@ -142,6 +211,13 @@ def borders_of(lines_cm: dict[int, np.ndarray]) -> RoadEdges:
     return RoadEdges(np.concatenate(points), np.concatenate(normals))
 
 
+def beyond_a_junction(beside_cm: float) -> RoadEdges:
+    """Borders of a lane from 50 to 90 cm ahead."""
+    return together(
+        *(tape(np.array([[x, 50.0], [x, 90.0]]), 3.0) for x in (beside_cm - 20.0, beside_cm + 20.0))
+    )
+
+
 def with_a_speck(edges: RoadEdges) -> RoadEdges:
     """Add a reflection like a piece of tape that leans to the right, where the left line has ended."""
     y = np.arange(14.0, 31.0, 0.5)
@@ -151,8 +227,13 @@ def with_a_speck(edges: RoadEdges) -> RoadEdges:
     return RoadEdges(np.concatenate([edges.points_cm, *points]), np.concatenate([edges.normals, *normals]))
 
 
-def drive_into_a_side_road(goes_on: bool, speck: bool = False) -> tuple[LaneTracker, np.ndarray]:
-    """The right line turns away 20 cm ahead; the left one goes on in parallel, or has ended."""
+def drive_into_a_side_road(
+    goes_on: bool, speck: bool = False, other_border: bool = False
+) -> tuple[LaneTracker, np.ndarray]:
+    """The right line turns away 20 cm ahead; the left one goes on in parallel, or has ended.
+
+    The road's other border, beyond a second lane to the left, may go on in parallel as well.
+    """
     tracker = LaneTracker(LaneMemory(WIDTH_CM), view=CameraView(example_camera()))
     y = np.arange(-5.0, 46.0, 1.0)
     straight = borders_of({0: np.full_like(y, -20.0), 1: np.full_like(y, 20.0)})
@@ -172,6 +253,7 @@ def drive_into_a_side_road(goes_on: bool, speck: bool = False) -> tuple[LaneTrac
 
         right = 20.0 + bend(radius_cm - 20.0)
         lines = {1: right} | ({0: -20.0 + bend(radius_cm + 20.0)} if goes_on else {})
+        lines |= {2: -60.0 + bend(radius_cm + 60.0)} if other_border else {}
         guess = np.concatenate(
             [np.interp([0, 15, 30], y, -20.0 + bend(radius_cm + 20.0)), np.interp([0, 15, 30], y, right)]
         )
@@ -188,6 +270,24 @@ def test_the_tracker_goes_straight_on_where_one_line_leaves_and_the_other_has_en
     assert found_cm == pytest.approx(LANE.reshape(6), abs=1.0)
 
 
+def test_the_tracker_goes_to_where_it_sees_the_lane_beyond_a_junction():
+    tracker, found_cm = drive_into_a_side_road(goes_on=False)
+    before_cm = found_cm.reshape(2, 3).mean(axis=0)
+    for _ in range(4):
+        tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
+        found_cm = tracker.follow(LANE.reshape(6), np.full(6, 5.0), np.zeros(2), beyond_a_junction(10.0))[0]
+    after_cm = found_cm.reshape(2, 3).mean(axis=0)
+    assert tracker.straight_on.on and before_cm == pytest.approx(np.zeros(3), abs=1.0)
+    assert after_cm[2] > 4.0 and after_cm[0] + 2.0 * (after_cm[2] - after_cm[0]) == pytest.approx(
+        10.0, abs=1.5
+    )
+
+
+def test_the_tracker_follows_a_bend_of_which_it_sees_the_roads_other_border():
+    tracker, _ = drive_into_a_side_road(goes_on=False, other_border=True)
+    assert not tracker.straight_on.on
+
+
 def test_the_tracker_follows_a_bend():
     tracker, found_cm = drive_into_a_side_road(goes_on=True)
     assert not tracker.straight_on.on
@@ -198,7 +298,7 @@ def test_a_speck_beside_a_line_that_turns_away_is_not_the_lanes_other_line():
     lane = StraightOn()
     speck = [-17.0, -11.0, -8.0]
     assert not lane.is_a_speck(speck, 10.0, 0, WIDTH_CM), "no lane is known yet"
-    lane.look(seen(LANE), leaving=None, ended=False, width_cm=WIDTH_CM)
+    lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
     assert lane.is_a_speck(speck, 10.0, 0, WIDTH_CM)
     assert not lane.is_a_speck(speck, 25.0, 0, WIDTH_CM), "as long as a line"
     assert not lane.is_a_speck([-19.0, -18.0, -16.0], 10.0, 0, WIDTH_CM), "where the line would be"

@@ -33,12 +33,20 @@ _SEEN_CM, _SAME, _STRAIGHT = 12.0, 0.12, 0.08
 #: Two lines are, if their distance is between these shares of the width, and their middle not further from
 #: the expected one than this. Chosen.
 _NARROW, _WIDE, _BESIDE = 0.8, 1.25, 0.35
+#: Presence below which the lane's other line may have ended. On `garage_tape` a blurred one that goes on has
+#: 0.67 and more. After so many frames in which a line turns away the other one has ended as well if it is
+#: hardly seen, since the network may take a reflection for it; and for so many frames after the last of them
+#: the turn is remembered. Chosen on 29 lost roads of two seeds.
+_ENDED, _LONG, _RECENT = 0.62, 4, 6
 #: A line beside one that turns away, where it is not expected, counts if it is seen over this length, [cm].
 #: Tried: 12, 16 and 20 pass two, three and three of three mouths of side roads in glare; with no limit, 0.6 %
 #: of the points of `garage_tape` are lost.
 _SPECK_CM = 20.0
 #: Sigma of the continued lane beside the car, and per cm ahead and driven since. Chosen: 1.5 degrees.
 _PLACE_CM, _DIRECTION_RAD = 1.0, 0.026
+#: What a lane that is seen again ahead is compared with: how far beside the expected place it is beside the
+#: car per cm driven, by how much its slope differs, and sigma of the points ahead. Chosen: roads bend.
+_BENT, _SLOPE, _SEEN_AHEAD_CM = 0.06, 0.1, 1.0
 #: The same while nobody tells how the car moves: more than what counts as known.
 _UNTOLD_CM = 100.0
 #: Distance and frames after which it is given up. Chosen: a junction of four lanes; 2 s at 20 frames/s.
@@ -91,6 +99,8 @@ class StraightOn:
         self.leaving: int | None = None
         self._lines_cm: Float[np.ndarray, "2 3"] | None = None
         self._suspicious = self._frames = 0
+        self._turned: int | None = None
+        self._turning = self._since = 0
         self._driven_cm = 0.0
 
     def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
@@ -146,18 +156,24 @@ class StraightOn:
             return False
         return abs(points_cm[_MIDDLE] - float(self._lines_cm[side, _MIDDLE])) >= _SAME * width_cm
 
-    def look(self, lines: SeenLines, leaving: int | None, ended: bool, width_cm: float) -> None:
+    def look(self, lines: SeenLines, leaving: int | None, presence: Sequence[float], width_cm: float) -> None:
         """Take a frame while the lane is not continued.
 
         Args:
             lines: Its lines.
             leaving: The one that turns away, while the other one, which would be in sight, does not.
-            ended: Whether the other one has probably come to its end.
+            presence: Probability of each line, by the network.
             width_cm: The lane's width.
         """
-        self.leaving = leaving
         leaves = leaving is not None
-        self._suspicious = self._suspicious + 1 if leaves and ended else max(0, self._suspicious - 1)
+        self.leaving = self._recently_leaving(leaving)
+        if self.leaving is not None and self._has_ended(1 - self.leaving, lines, presence, leaves):
+            self._suspicious += 1
+        else:
+            self.leaving = leaving
+            # A frame that shows neither line well says nothing against it.
+            if min(lines.seen_cm) >= _PLAIN_CM:
+                self._suspicious = max(0, self._suspicious - 1)
         self._frames += 1
         if not leaves and self._suspicious == 0 and _is_plain(lines, width_cm):
             # Their direction 15 cm ahead, as far as both are seen.
@@ -171,6 +187,39 @@ class StraightOn:
             self._lines_cm = None
         if self._suspicious >= _AFTER and self._lines_cm is not None:
             self.on, self._suspicious, self._frames = True, 0, 0
+
+    def _recently_leaving(self, leaving: int | None) -> int | None:
+        """Return the line that turns away, or did so a few frames ago, and count for how long."""
+        if leaving is None:
+            self._since += 1
+            return self._turned if self._since <= _RECENT else None
+        goes_on = leaving == self._turned and self._since <= _RECENT
+        self._turning = self._turning + 1 if goes_on else 1
+        self._turned, self._since = leaving, 0
+        return leaving
+
+    def _has_ended(self, side: int, lines: SeenLines, presence: Sequence[float], leaves: bool) -> bool:
+        """Return whether the line beside one that turns away, or has done so, seems to have ended."""
+        hardly_seen, unlikely = lines.seen_cm[side] < _PLAIN_CM, presence[side] < _ENDED
+        return (unlikely and (leaves or hardly_seen)) or (self._turning >= _LONG and hardly_seen)
+
+    def anchor(self, middle_cm: Float[np.ndarray, "k 2"], width_cm: float) -> None:
+        """Turn the continued lane to where it is seen further ahead, by least squares.
+
+        Args:
+            middle_cm: Points in the middle of the lane there, frame car.
+            width_cm: The lane's width.
+        """
+        assert self._lines_cm is not None
+        near_cm, far_cm = self._lines_cm.mean(axis=0)[[0, -1]]
+        slope = (far_cm - near_cm) / (_ROWS[-1] - _ROWS[0])
+        sigma_cm = np.array([_PLACE_CM + _BENT * self._driven_cm, _SLOPE, *[_SEEN_AHEAD_CM] * len(middle_cm)])
+        change = np.array([[1.0, 0.0], [0.0, 1.0], *([1.0, y] for y in middle_cm[:, 1])])
+        wanted = np.array([near_cm, slope, *middle_cm[:, 0]])
+        (near_cm, slope), *_ = np.linalg.lstsq(change / sigma_cm[:, None], wanted / sigma_cm, rcond=None)
+        half_cm = 0.5 * width_cm * math.hypot(1.0, slope)
+        self._lines_cm = np.array([[-half_cm], [half_cm]]) + near_cm + slope * (_ROWS - _ROWS[0])
+        self._driven_cm = 0.0
 
     def look_for_its_end(self, lines: SeenLines, found: bool, width_cm: float) -> None:
         """Take a frame while the lane is continued.

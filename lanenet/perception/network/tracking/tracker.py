@@ -22,6 +22,7 @@ from lanenet.perception.network.corner import corners
 from lanenet.perception.network.refinement import RoadBorders, refined
 from lanenet.perception.network.tracking.camera_view import CameraView
 from lanenet.perception.network.tracking.lane_belief import Keep, LineLooks
+from lanenet.perception.network.tracking.lane_beyond import lane_beyond
 from lanenet.perception.network.tracking.line_beside import SeenLine, WidthHere, line_beside
 from lanenet.perception.network.tracking.marking_widths import MarkingWidths
 from lanenet.perception.network.tracking.pair import Candidate, Pair, best_pair, tells_width
@@ -75,8 +76,6 @@ _CHANGED, _SAME = 0.5, 0.3
 #: The 95th percentile of the errors of 144 simulated drives fell from 1.86 to 1.80 cm, of three real ones
 #: from 1.01, 1.81 and 1.65 to 0.99, 1.67 and 1.61, for lanes of 40 cm.
 _RECALLED = 0.15
-#: Presence below which a line may have ended. On `garage_tape` a blurred one that goes on has 0.67 and more.
-_ENDED = 0.62
 #: So far beyond a corner a line still holds. Tried: 0, 2 and 4 cm refuse 79, 56 and 40 points that are more
 #: than 2 cm off on 144 simulated drives, and 109, 90 and 76 others.
 _CORNER_CM = 2.0
@@ -407,40 +406,49 @@ class LaneTracker:
         left, right = pair
         points_cm = left.points_cm, right.points_cm
         lines = SeenLines(points_cm, (left.seen_cm, right.seen_cm), (left.seen_at, right.seen_at))
-        bends, leaving, ended = self._turning(pair, presence, width_cm, borders)
+        bends, leaving = self._turning(pair, width_cm, borders)
         if self.straight_on.on:
             assert self.straight_on.leaving is not None
             other = 1 - self.straight_on.leaving
             goes_on = presence[other] > SURE and pair[other].seen_cm >= _WIDTH_SEEN_CM
             self.straight_on.look_for_its_end(lines, bends or goes_on, width_cm)
         else:
-            self.straight_on.look(lines, leaving, ended, width_cm)
+            self.straight_on.look(lines, leaving, presence, width_cm)
+        if self.straight_on.on:
+            continued_cm, _ = self.straight_on.lane()
+            markings_cm = [self._markings.usual_cm(side) or _MARKING_CM for side in range(len(SIDES))]
+            beyond_cm = lane_beyond(continued_cm, width_cm, markings_cm, borders.edges)
+            if beyond_cm is not None:
+                self.straight_on.anchor(beyond_cm, width_cm)
         return self.straight_on.on
 
-    def _turning(
-        self,
-        pair: Pair,
-        presence: list[float],
-        width_cm: float,
-        borders: RoadBorders,
-    ) -> tuple[bool, int | None, bool]:
-        """Return whether the lines turn together, or which one does alone, and if the other has ended."""
+    def _turning(self, pair: Pair, width_cm: float, borders: RoadBorders) -> tuple[bool, int | None]:
+        """Return whether the lines turn together, or which one does alone."""
         for side, (line, other) in enumerate(zip(pair, pair[::-1], strict=True)):
             turns = self.straight_on.turns_away(line.points_cm, line.seen_at, side, width_cm)
             if line.seen_cm < _LINE_SEEN_CM or not turns or self.looks.is_between_lanes(side):
                 continue
-            beside_cm = parallel_points(np.array(line.points_cm), width_cm if side == 0 else -width_cm)
-            if not np.isfinite(beside_cm).all() or self._view is None or not self._view.shows_line(beside_cm):
+            # Beyond the lane beside it the road's other border turns as well.
+            turn_with_it = [self._turns_with(line, side, lanes * width_cm, borders) for lanes in (1, 2)]
+            if any(turn_with_it):
+                return True, None
+            if turn_with_it[0] is None:
                 continue
-            sigma_cm = _moved(line.sigma_cm)
-            (found,) = self._refine([_Start(1 - side, beside_cm.tolist(), sigma_cm, 0.0, None)], borders)
-            off_cm = np.abs(found.points_cm - beside_cm).max()
-            if found.seen_at[-1] and found.seen_cm >= _WIDTH_SEEN_CM and off_cm < _BESIDE * width_cm:
-                return True, None, False
             speck = self.straight_on.is_a_speck(other.points_cm, other.seen_cm, 1 - side, width_cm)
             if not other.seen_at[-1] or other.seen_cm < _LINE_SEEN_CM or speck:
-                return False, side, presence[1 - side] < _ENDED
-        return False, None, False
+                return False, side
+        return False, None
+
+    def _turns_with(self, line: Candidate, side: int, across_cm: float, borders: RoadBorders) -> bool | None:
+        """Return whether there is a line parallel to one of a side; None if it would be out of view."""
+        beside_cm = parallel_points(np.array(line.points_cm), across_cm if side == 0 else -across_cm)
+        if not np.isfinite(beside_cm).all() or self._view is None or not self._view.shows_line(beside_cm):
+            return None
+        start = _Start(1 - side, beside_cm.tolist(), _moved(line.sigma_cm), 0.0, None)
+        (found,) = self._refine([start], borders)
+        off_cm = np.abs(found.points_cm - beside_cm).max()
+        is_near = bool(off_cm < _BESIDE * self.lane.likely_cm)
+        return found.seen_at[-1] and found.seen_cm >= _WIDTH_SEEN_CM and is_near
 
     def _notice_change(self, pair: Pair) -> None:
         """Notice that one of the lane's lines was the other one before: the car is in the next lane."""
