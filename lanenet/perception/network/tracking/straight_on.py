@@ -45,8 +45,9 @@ _SPECK_CM = 20.0
 #: Sigma of the continued lane beside the car, and per cm ahead and driven since. Chosen: 1.5 degrees.
 _PLACE_CM, _DIRECTION_RAD = 1.0, 0.026
 #: What a lane that is seen again ahead is compared with: how far beside the expected place it is beside the
-#: car per cm driven, by how much its slope differs, and sigma of the points ahead. Chosen: roads bend.
-_BENT, _SLOPE, _SEEN_AHEAD_CM = 0.06, 0.1, 1.0
+#: car per cm driven, by how much its slope differs, and sigma of the points ahead; how many of the first
+#: sigmas it may lie beside. Chosen: roads bend.
+_BENT, _SLOPE, _SEEN_AHEAD_CM, _MOST_SIGMAS = 0.06, 0.1, 1.0, 2.0
 #: The same while nobody tells how the car moves: more than what counts as known.
 _UNTOLD_CM = 100.0
 #: Distance and frames after which it is given up. Chosen: a junction of four lanes; 2 s at 20 frames/s.
@@ -101,6 +102,7 @@ class StraightOn:
         self._suspicious = self._frames = 0
         self._turned: int | None = None
         self._turning = self._since = 0
+        self._unseen = [_RECENT, _RECENT]
         self._driven_cm = 0.0
 
     def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
@@ -166,6 +168,8 @@ class StraightOn:
             width_cm: The lane's width.
         """
         leaves = leaving is not None
+        for side, seen_cm in enumerate(lines.seen_cm):
+            self._unseen[side] = 0 if seen_cm >= _PLAIN_CM else self._unseen[side] + 1
         self.leaving = self._recently_leaving(leaving)
         if self.leaving is not None and self._has_ended(1 - self.leaving, lines, presence, leaves):
             self._suspicious += 1
@@ -199,12 +203,17 @@ class StraightOn:
         return leaving
 
     def _has_ended(self, side: int, lines: SeenLines, presence: Sequence[float], leaves: bool) -> bool:
-        """Return whether the line beside one that turns away, or has done so, seems to have ended."""
-        hardly_seen, unlikely = lines.seen_cm[side] < _PLAIN_CM, presence[side] < _ENDED
-        return (unlikely and (leaves or hardly_seen)) or (self._turning >= _LONG and hardly_seen)
+        """Return whether the line beside one that turns away, or has done so, seems to have ended there."""
+        if presence[side] < _ENDED and leaves:
+            return True
+        # One that has not been seen for long did not end where the other one turns.
+        vanishes = 0 < self._unseen[side] < _RECENT
+        return vanishes and (presence[side] < _ENDED or self._turning >= _LONG)
 
     def anchor(self, middle_cm: Float[np.ndarray, "k 2"], width_cm: float) -> None:
         """Turn the continued lane to where it is seen further ahead, by least squares.
+
+        A lane that leads to another place beside the car is another one.
 
         Args:
             middle_cm: Points in the middle of the lane there, frame car.
@@ -216,9 +225,11 @@ class StraightOn:
         sigma_cm = np.array([_PLACE_CM + _BENT * self._driven_cm, _SLOPE, *[_SEEN_AHEAD_CM] * len(middle_cm)])
         change = np.array([[1.0, 0.0], [0.0, 1.0], *([1.0, y] for y in middle_cm[:, 1])])
         wanted = np.array([near_cm, slope, *middle_cm[:, 0]])
-        (near_cm, slope), *_ = np.linalg.lstsq(change / sigma_cm[:, None], wanted / sigma_cm, rcond=None)
+        (start_cm, slope), *_ = np.linalg.lstsq(change / sigma_cm[:, None], wanted / sigma_cm, rcond=None)
+        if abs(start_cm - near_cm) > _MOST_SIGMAS * sigma_cm[0]:
+            return
         half_cm = 0.5 * width_cm * math.hypot(1.0, slope)
-        self._lines_cm = np.array([[-half_cm], [half_cm]]) + near_cm + slope * (_ROWS - _ROWS[0])
+        self._lines_cm = np.array([[-half_cm], [half_cm]]) + start_cm + slope * (_ROWS - _ROWS[0])
         self._driven_cm = 0.0
 
     def look_for_its_end(self, lines: SeenLines, found: bool, width_cm: float) -> None:
