@@ -70,6 +70,15 @@ def test_a_line_that_turns_away_for_long_beside_one_that_is_hardly_seen_is_a_jun
     assert lane.on
 
 
+def test_a_line_that_was_not_seen_for_long_did_not_end_where_the_other_one_turns():
+    lane = in_a_lane()
+    for _ in range(8):
+        lane.look(seen(LANE, 0.0), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    for _ in range(8):
+        lane.look(seen(SIDE_ROAD, 0.0), leaving=1, presence=BOTH, width_cm=WIDTH_CM)
+    assert not lane.on
+
+
 @pytest.mark.parametrize("between", [1, 5, 6])
 def test_that_a_line_turned_away_is_remembered_until_the_other_one_has_ended(between):
     lane = in_a_lane()
@@ -167,6 +176,14 @@ def test_the_more_of_it_is_seen_ahead_the_less_counts_the_way_to_there():
         lane.anchor(ahead(8.0, *y_cm), WIDTH_CM)
         beside_cm.append(lane.lane()[0].mean(axis=0)[0])
     assert 0.0 < beside_cm[0] < 4.0 < beside_cm[1] < 8.0
+
+
+def test_a_lane_that_leads_to_another_place_beside_the_car_is_another_one():
+    lane = at_a_junction()
+    lane.moved(50.0, 0.0, WHEELBASE_CM)
+    before_cm = lane.lane()[0]
+    lane.anchor(ahead(15.0, 45.0, 60.0, 75.0), WIDTH_CM)
+    assert lane.lane()[0] == pytest.approx(before_cm)
 
 
 def test_it_ends_when_one_line_is_where_it_is_expected():
