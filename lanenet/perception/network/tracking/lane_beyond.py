@@ -21,8 +21,9 @@ _ROWS = np.array(ROWS_CM)
 _AHEAD_CM = 45.0
 _MIDDLE_CM = _AHEAD_CM + ROWS_CM[1]
 #: How far from where the lane goes straight on it may be there, as a share of its width, and by how much its
-#: slope, dx/dy, may differ; steps of both. Of 148 lanes found in 278 frames at junctions of 29 roads, 17 were
-#: more than 6 cm off with 0.5 and 0.4 and lines seen over 6 cm; among those that are left, none.
+#: slope, dx/dy, may differ; steps of both. In 278 frames at junctions of 29 simulated roads these limits, and
+#: lines seen over 12 cm, leave 101 lanes that are 0.15 cm off (median) and 2.8 cm at most, 60 cm ahead, where
+#: the lane that goes straight on is 4.7 cm off. With 0.5, 0.4 and 6 cm 14 of 148 are more than 6 cm off.
 _BESIDE, _TURNED, _OFFSETS, _SLOPES = 0.4, 0.35, 9, 7
 #: The same for what is found. Chosen: half a step more.
 _MOST_BESIDE, _MOST_TURNED = 0.45, 0.4
