@@ -245,7 +245,7 @@ def with_a_speck(edges: RoadEdges) -> RoadEdges:
 
 
 def drive_into_a_side_road(
-    goes_on: bool, speck: bool = False, other_border: bool = False
+    goes_on: bool, speck: bool = False, other_border: bool = False, straight_border: bool = False
 ) -> tuple[LaneTracker, np.ndarray]:
     """The right line turns away 20 cm ahead; the left one goes on in parallel, or has ended.
 
@@ -271,6 +271,7 @@ def drive_into_a_side_road(
         right = 20.0 + bend(radius_cm - 20.0)
         lines = {1: right} | ({0: -20.0 + bend(radius_cm + 20.0)} if goes_on else {})
         lines |= {2: -60.0 + bend(radius_cm + 60.0)} if other_border else {}
+        lines |= {2: np.full_like(y, -60.0)} if straight_border else {}
         guess = np.concatenate(
             [np.interp([0, 15, 30], y, -20.0 + bend(radius_cm + 20.0)), np.interp([0, 15, 30], y, right)]
         )
@@ -303,6 +304,22 @@ def test_the_tracker_goes_to_where_it_sees_the_lane_beyond_a_junction():
 def test_the_tracker_follows_a_bend_of_which_it_sees_the_roads_other_border():
     tracker, _ = drive_into_a_side_road(goes_on=False, other_border=True)
     assert not tracker.straight_on.on
+
+
+def test_the_roads_other_border_that_goes_straight_on_proves_no_bend():
+    assert drive_into_a_side_road(goes_on=False, straight_border=True)[0].straight_on.on
+
+
+def test_a_turn_is_forgotten_with_its_junction():
+    lane = in_a_lane()
+    for _ in range(5):
+        lane.look(seen(SIDE_ROAD, 6.0), leaving=1, presence=BOTH, width_cm=WIDTH_CM)
+    assert lane.on
+    lane.look_for_its_end(seen(SIDE_ROAD, 6.0), found=True, width_cm=WIDTH_CM)
+    lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    for _ in range(3):
+        lane.look(seen(LANE, 6.0), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    assert not lane.on
 
 
 def test_the_tracker_follows_a_bend():

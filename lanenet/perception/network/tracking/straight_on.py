@@ -99,11 +99,16 @@ class StraightOn:
         self.on = self._told = False
         self.leaving: int | None = None
         self._lines_cm: Float[np.ndarray, "2 3"] | None = None
-        self._suspicious = self._frames = 0
+        self._frames = 0
+        self._driven_cm = 0.0
+        self.forget_turn()
+
+    def forget_turn(self) -> None:
+        """Forget that a line turned away: the lane bends, or the junction is behind the car."""
+        self._suspicious = 0
         self._turned: int | None = None
         self._turning = self._since = 0
         self._unseen = [_RECENT, _RECENT]
-        self._driven_cm = 0.0
 
     def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
         """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`.
@@ -122,6 +127,7 @@ class StraightOn:
             # Not a number where the motion is none.
             if not abs(x_1 - x_0) <= _STEEPEST * (y_1 - y_0):
                 self.on, self._lines_cm = False, None
+                self.forget_turn()
                 return
             line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
 
@@ -245,6 +251,7 @@ class StraightOn:
         too_long = self._frames > _LONGEST or self._driven_cm > _FARTHEST_CM
         if too_long or found or self._are_the_lanes(lines, self._lines_cm, width_cm):
             self.on, self._lines_cm = False, None
+            self.forget_turn()
 
     @staticmethod
     def _are_the_lanes(lines: SeenLines, expected_cm: Float[np.ndarray, "2 3"], width_cm: float) -> bool:

@@ -26,7 +26,7 @@ from lanenet.perception.network.tracking.lane_beyond import lane_beyond
 from lanenet.perception.network.tracking.line_beside import SeenLine, WidthHere, line_beside
 from lanenet.perception.network.tracking.marking_widths import MarkingWidths
 from lanenet.perception.network.tracking.pair import Candidate, Pair, best_pair, tells_width
-from lanenet.perception.network.tracking.straight_on import SeenLines, StraightOn
+from lanenet.perception.network.tracking.straight_on import SeenLines, StraightOn, turns_away_cm
 from lanenet.perception.network.tracking.which_lane import WhichLane
 
 #: Factor on a network's own sigma. On nine drives, eight simulated, refined lines lay within one and two
@@ -85,6 +85,9 @@ _CORNER_CM = 2.0
 _GOES_ON_CM, _GOES_ON_SEEN_CM = 38.0, 28.0
 #: The other line of a bend is found within this share of the width of where it is expected. Chosen.
 _BESIDE = 0.1
+#: The road's other border turns with a bend if it turns by this share of what a parallel line would, where
+#: that is plain, [cm]: a straight one lies within the same distance. Chosen: one that bends does so by 0.8.
+_BENT, _LEAST_BENT_CM = 0.5, 1.5
 _NOWHERE, _UNSEEN = [False] * len(ROWS_CM), [math.nan] * len(ROWS_CM)
 
 
@@ -413,6 +416,8 @@ class LaneTracker:
             goes_on = presence[other] > SURE and pair[other].seen_cm >= _WIDTH_SEEN_CM
             self.straight_on.look_for_its_end(lines, bends or goes_on, width_cm)
         else:
+            if bends:
+                self.straight_on.forget_turn()
             self.straight_on.look(lines, leaving, presence, width_cm)
         if self.straight_on.on:
             continued_cm, _ = self.straight_on.lane()
@@ -429,18 +434,23 @@ class LaneTracker:
             if line.seen_cm < _LINE_SEEN_CM or not turns or self.looks.is_between_lanes(side):
                 continue
             # Beyond the lane beside it the road's other border turns as well.
-            turn_with_it = [self._turns_with(line, side, lanes * width_cm, borders) for lanes in (1, 2)]
-            if any(turn_with_it):
+            turns_with_it = self._turns_with(line, side, width_cm, borders)
+            if turns_with_it or self._turns_with(line, side, 2.0 * width_cm, borders, _BENT):
                 return True, None
-            if turn_with_it[0] is None:
+            if turns_with_it is None:
                 continue
             speck = self.straight_on.is_a_speck(other.points_cm, other.seen_cm, 1 - side, width_cm)
             if not other.seen_at[-1] or other.seen_cm < _LINE_SEEN_CM or speck:
                 return False, side
         return False, None
 
-    def _turns_with(self, line: Candidate, side: int, across_cm: float, borders: RoadBorders) -> bool | None:
-        """Return whether there is a line parallel to one of a side; None if it would be out of view."""
+    def _turns_with(
+        self, line: Candidate, side: int, across_cm: float, borders: RoadBorders, least_bent: float = 0.0
+    ) -> bool | None:
+        """Return whether there is a line parallel to one of a side; None where none would be in view.
+
+        It turns by this share at least of what a parallel one does.
+        """
         beside_cm = parallel_points(np.array(line.points_cm), across_cm if side == 0 else -across_cm)
         if not np.isfinite(beside_cm).all() or self._view is None or not self._view.shows_line(beside_cm):
             return None
@@ -448,7 +458,9 @@ class LaneTracker:
         (found,) = self._refine([start], borders)
         off_cm = np.abs(found.points_cm - beside_cm).max()
         is_near = bool(off_cm < _BESIDE * self.lane.likely_cm)
-        return found.seen_at[-1] and found.seen_cm >= _WIDTH_SEEN_CM and is_near
+        turn_cm, expected_cm = (turns_away_cm(x, side) for x in (found.points_cm, beside_cm.tolist()))
+        bends = least_bent == 0.0 or (expected_cm > _LEAST_BENT_CM and turn_cm > least_bent * expected_cm)
+        return found.seen_at[-1] and found.seen_cm >= _WIDTH_SEEN_CM and is_near and bends
 
     def _notice_change(self, pair: Pair) -> None:
         """Notice that one of the lane's lines was the other one before: the car is in the next lane."""
