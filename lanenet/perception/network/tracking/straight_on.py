@@ -44,12 +44,12 @@ _ENDED, _LONG, _RECENT = 0.62, 4, 6
 _SPECK_CM = 20.0
 #: Sigma of the continued lane beside the car, and per cm ahead and driven since. Chosen: 1.5 degrees.
 _PLACE_CM, _DIRECTION_RAD = 1.0, 0.026
-#: What a lane that is seen again ahead is compared with: how far beside the expected place it is beside the
-#: car per cm driven, by how much its slope differs, and sigma of the points ahead; how many of the first
-#: sigmas it may lie beside. Chosen: roads bend.
-_BENT, _SLOPE, _SEEN_AHEAD_CM, _MOST_SIGMAS = 0.06, 0.1, 1.0, 2.0
 #: The same while nobody tells how the car moves: more than what counts as known.
 _UNTOLD_CM = 100.0
+#: Of the lane, where it is seen again ahead: sigma of its place beside the car, per cm driven, and of its
+#: slope, dx/dy; sigma of the points ahead; beyond how many of the first sigmas it is another lane. Chosen:
+#: roads bend.
+_BENT, _SLOPE, _SEEN_AHEAD_CM, _MOST_SIGMAS = 0.06, 0.1, 1.0, 2.0
 #: Distance and frames after which it is given up. Chosen: a junction of four lanes; 2 s at 20 frames/s.
 _FARTHEST_CM, _LONGEST = 160.0, 40
 #: A car that stands across a lane at a larger slope, cm beside per cm ahead, has left it. Chosen: 45 degrees.
@@ -177,7 +177,7 @@ class StraightOn:
         for side, seen_cm in enumerate(lines.seen_cm):
             self._unseen[side] = 0 if seen_cm >= _PLAIN_CM else self._unseen[side] + 1
         self.leaving = self._recently_leaving(leaving)
-        if self.leaving is not None and self._has_ended(1 - self.leaving, lines, presence, leaves):
+        if self.leaving is not None and self._has_ended(1 - self.leaving, presence, leaves):
             self._suspicious += 1
         else:
             self.leaving = leaving
@@ -199,7 +199,7 @@ class StraightOn:
             self.on, self._suspicious, self._frames = True, 0, 0
 
     def _recently_leaving(self, leaving: int | None) -> int | None:
-        """Return the line that turns away, or did so a few frames ago, and count for how long."""
+        """Take the line that turns away, and return it, or the one that did so a few frames ago."""
         if leaving is None:
             self._since += 1
             return self._turned if self._since <= _RECENT else None
@@ -208,7 +208,7 @@ class StraightOn:
         self._turned, self._since = leaving, 0
         return leaving
 
-    def _has_ended(self, side: int, lines: SeenLines, presence: Sequence[float], leaves: bool) -> bool:
+    def _has_ended(self, side: int, presence: Sequence[float], leaves: bool) -> bool:
         """Return whether the line beside one that turns away, or has done so, seems to have ended there."""
         if presence[side] < _ENDED and leaves:
             return True
