@@ -142,11 +142,35 @@ def test_a_lane_that_the_car_turned_away_from_is_forgotten(motion):
     assert lane.doubts(SIDE_ROAD.reshape(6), WIDTH_CM) is None
 
 
-def test_its_place_is_less_sure_after_reversing():
+def test_its_place_is_as_sure_as_before_where_the_car_has_come_back():
     lane = at_a_junction()
     before_cm = lane.lane()[1]
-    lane.moved(-5.0, 0.0, WHEELBASE_CM)
+    lane.moved(20.0, 0.0, WHEELBASE_CM)
     assert (lane.lane()[1] > before_cm).all()
+    lane.moved(-20.0, 0.0, WHEELBASE_CM)
+    assert lane.lane()[1] == pytest.approx(before_cm)
+
+
+def test_a_lane_that_was_plain_half_a_metre_ago_is_not_continued():
+    lanes = in_a_lane(), in_a_lane()
+    for lane, travel_cm in zip(lanes, (40.0, 50.0), strict=True):
+        lane.moved(travel_cm, 0.0, WHEELBASE_CM)
+        for _ in range(2):
+            lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+    assert [lane.on for lane in lanes] == [True, False]
+
+
+def test_however_long_a_line_was_suspected_one_plain_frame_is_half_of_the_way_back():
+    lane = in_a_lane()
+    lane.moved(50.0, 0.0, WHEELBASE_CM)
+    for _ in range(20):
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+    for _ in range(3):
+        lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    for _ in range(2):
+        assert not lane.on
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+    assert lane.on
 
 
 def ahead(beside_cm: float, *y_cm: float) -> np.ndarray:
@@ -166,6 +190,29 @@ def test_it_turns_to_where_the_lane_is_seen_ahead():
     assert 0.0 < middle_cm[0] < 3.0, "beside the car it is where it was, nearly"
     assert points_cm[1] - points_cm[0] == pytest.approx(np.full(3, WIDTH_CM * math.hypot(1.0, slope)))
     assert (sigma_cm < before_cm).all()
+    assert (sigma_cm[:, 0] > 0.5 * before_cm[:, 0]).all(), "one point far ahead says little of the place here"
+
+
+def test_sigma_is_that_of_the_least_squares_fit():
+    lane, y_cm = at_a_junction(), np.array([45.0, 60.0, 75.0])
+    lane.moved(30.0, 0.0, WHEELBASE_CM)
+    slope = np.array([[1.0, 30.0], [0.0, 1.0]])
+    before = slope @ np.diag([0.5**2, 0.055**2]) @ slope.T + np.diag([0.0, 0.1**2])
+    lane.anchor(ahead(2.0, *y_cm), WIDTH_CM)
+    seen_at = np.column_stack([np.ones(3), y_cm])
+    after = np.linalg.inv(np.linalg.inv(before) + seen_at.T @ seen_at)
+    rows = np.column_stack([np.ones(3), [0.0, 15.0, 30.0]])
+    expected_cm = np.sqrt(np.diag(rows @ after @ rows.T) + 0.8**2)
+    assert lane.lane()[1] == pytest.approx(np.tile(expected_cm, (2, 1)))
+
+
+def test_a_lane_that_is_seen_ahead_is_continued_no_further_than_another():
+    lane = at_a_junction()
+    for _ in range(9):
+        lane.moved(20.0, 0.0, WHEELBASE_CM)
+        lane.anchor(ahead(0.0, 45.0, 60.0), WIDTH_CM)
+    lane.look_for_its_end(seen(SIDE_ROAD, left_cm=0.0), found=False, width_cm=WIDTH_CM)
+    assert not lane.on
 
 
 def test_the_more_of_it_is_seen_ahead_the_less_counts_the_way_to_there():
@@ -245,17 +292,22 @@ def with_a_speck(edges: RoadEdges) -> RoadEdges:
 
 
 def drive_into_a_side_road(
-    goes_on: bool, speck: bool = False, other_border: bool = False, straight_border: bool = False
+    goes_on: bool,
+    speck: bool = False,
+    other_border: bool = False,
+    straight_border: bool = False,
+    mirrored: bool = False,
 ) -> tuple[LaneTracker, np.ndarray]:
     """The right line turns away 20 cm ahead; the left one goes on in parallel, or has ended.
 
-    The road's other border, beyond a second lane to the left, may go on in parallel as well.
+    The road's other border, beyond a second lane to the left, may go on in parallel as well. Mirrored, the
+    left line turns away.
     """
     tracker = LaneTracker(LaneMemory(WIDTH_CM), view=CameraView(example_camera()))
     y = np.arange(-5.0, 46.0, 1.0)
     straight = borders_of({0: np.full_like(y, -20.0), 1: np.full_like(y, 20.0)})
     sigma_cm, certain = np.full(6, 0.8), np.ones(2)
-    for _ in range(4):
+    for _ in range(12):
         tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
         tracker.follow(LANE.reshape(6), sigma_cm, certain, straight)
     radius_cm, found_cm = 45.0, np.empty(6)
@@ -277,13 +329,17 @@ def drive_into_a_side_road(
         )
         presence = np.array([1.0 if goes_on else 0.1, 1.0])
         edges = with_a_speck(borders_of(lines)) if speck else borders_of(lines)
+        if mirrored:
+            guess, presence = -guess.reshape(2, 3)[::-1].reshape(6), presence[::-1].copy()
+            edges = RoadEdges(edges.points_cm * [-1.0, 1.0], edges.normals * [-1.0, 1.0])
         found_cm = tracker.follow(guess, sigma_cm, presence, edges)[0]
     return tracker, found_cm
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("speck", [False, True])
-def test_the_tracker_goes_straight_on_where_one_line_leaves_and_the_other_has_ended(speck):
-    tracker, found_cm = drive_into_a_side_road(goes_on=False, speck=speck)
+def test_the_tracker_goes_straight_on_where_one_line_leaves_and_the_other_has_ended(speck, mirrored):
+    tracker, found_cm = drive_into_a_side_road(goes_on=False, speck=speck, mirrored=mirrored)
     assert tracker.straight_on.on
     assert found_cm == pytest.approx(LANE.reshape(6), abs=1.0)
 
@@ -301,13 +357,16 @@ def test_the_tracker_goes_to_where_it_sees_the_lane_beyond_a_junction():
     )
 
 
-def test_the_tracker_follows_a_bend_of_which_it_sees_the_roads_other_border():
-    tracker, _ = drive_into_a_side_road(goes_on=False, other_border=True)
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_tracker_follows_a_bend_of_which_it_sees_the_roads_other_border(mirrored):
+    tracker, _ = drive_into_a_side_road(goes_on=False, other_border=True, mirrored=mirrored)
     assert not tracker.straight_on.on
 
 
-def test_the_roads_other_border_that_goes_straight_on_proves_no_bend():
-    assert drive_into_a_side_road(goes_on=False, straight_border=True)[0].straight_on.on
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_roads_other_border_that_goes_straight_on_proves_no_bend(mirrored):
+    tracker, _ = drive_into_a_side_road(goes_on=False, straight_border=True, mirrored=mirrored)
+    assert tracker.straight_on.on
 
 
 def test_a_turn_is_forgotten_with_its_junction():
@@ -322,10 +381,11 @@ def test_a_turn_is_forgotten_with_its_junction():
     assert not lane.on
 
 
-def test_the_tracker_follows_a_bend():
-    tracker, found_cm = drive_into_a_side_road(goes_on=True)
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_tracker_follows_a_bend(mirrored):
+    tracker, found_cm = drive_into_a_side_road(goes_on=True, mirrored=mirrored)
     assert not tracker.straight_on.on
-    assert found_cm[4] > 22.0
+    assert np.abs(found_cm[[1, 4]]).max() > 22.0
 
 
 def test_a_speck_beside_a_line_that_turns_away_is_not_the_lanes_other_line():

@@ -45,7 +45,7 @@ _SEEN, _SEEN_AT = 7, slice(8, 11)
 def lane_beyond(
     lines_cm: Float[np.ndarray, "2 3"], width_cm: float, markings_cm: Sequence[float], edges: RoadEdges
 ) -> Float[np.ndarray, "k 2"] | None:
-    """Find the lane 45 to 87 cm ahead.
+    """Find the lane 41 to 87 cm ahead.
 
     Args:
         lines_cm: x of the lane's lines at the label rows if it goes straight on, frame car.

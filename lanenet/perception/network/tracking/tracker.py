@@ -420,12 +420,19 @@ class LaneTracker:
                 self.straight_on.forget_turn()
             self.straight_on.look(lines, leaving, presence, width_cm)
         if self.straight_on.on:
-            continued_cm, _ = self.straight_on.lane()
-            markings_cm = [self._markings.usual_cm(side) or _MARKING_CM for side in range(len(SIDES))]
-            beyond_cm = lane_beyond(continued_cm, width_cm, markings_cm, borders.edges)
-            if beyond_cm is not None:
-                self.straight_on.anchor(beyond_cm, width_cm)
+            self._look_beyond(width_cm, borders.edges)
         return self.straight_on.on
+
+    def _look_beyond(self, width_cm: float, edges: RoadEdges) -> None:
+        """Turn the continued lane to where both of its lines are seen further ahead."""
+        markings_cm = [self._markings.usual_cm(side) for side in range(len(SIDES))]
+        known_cm = [marking_cm for marking_cm in markings_cm if marking_cm is not None]
+        if not self.straight_on.told or len(known_cm) < len(SIDES):
+            return
+        continued_cm, _ = self.straight_on.lane()
+        beyond_cm = lane_beyond(continued_cm, width_cm, known_cm, edges)
+        if beyond_cm is not None:
+            self.straight_on.anchor(beyond_cm, width_cm)
 
     def _turning(self, pair: Pair, width_cm: float, borders: RoadBorders) -> tuple[bool, int | None]:
         """Return whether the lines turn together, or which one does alone."""
