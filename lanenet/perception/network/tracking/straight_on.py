@@ -25,9 +25,9 @@ _TURNS, _TURNS_STILL, _AFTER = (7.0, 0.15), (5.0, 0.12), 2
 _DOUBTED = 0.08
 #: A lane is plain whose lines are both seen in this length, [cm], have its width within this share beside the
 #: car and 15 cm ahead, and turn by less than this one. It is worth continuing for so many frames, with and
-#: without knowing the car's motion, and for this distance, [cm]. Chosen: of 44 continued lanes on 205 simulated
-#: roads two were 5 cm off at once, plain 51 and 66 cm before; of the others, which are not, all but one 36 at
-#: most.
+#: without knowing the car's motion, and for this distance, [cm]. Chosen: of 44 continued lanes on 205
+#: simulated roads two were 5 cm off at once, plain 51 and 66 cm before; of the others, which are not, all but
+#: one 36 at most.
 _PLAIN_CM, _PLAIN_WIDTH, _PLAIN_TURN, _FRESH, _FRESH_UNTOLD, _FRESH_CM = 9.0, 0.12, 0.12, 25, 6, 45.0
 #: A line is the lane's again if it is seen in this length, [cm], and if it is within this share of the width
 #: of where it is expected, and turns away by less than this one. Chosen.
@@ -44,9 +44,9 @@ _ENDED, _LONG, _RECENT = 0.62, 4, 6
 #: Tried: 12, 16 and 20 pass two, three and three of three mouths of side roads in glare; with no limit, 0.6 %
 #: of the points of `garage_tape` are lost.
 _SPECK_CM = 20.0
-#: Sigma of a plain lane's middle beside the car, [cm], and of its slope, dx/dy; what is added to the sigma that
-#: is told, [cm], since what consecutive frames show of a junction is wrong by the same. Fitted to 3000 points on
-#: 205 simulated roads, before the share of sigma that a tracker claims.
+#: Sigma of a plain lane's middle beside the car, [cm], and of its slope, dx/dy; what is added to the sigma
+#: that is told, [cm], since what consecutive frames show of a junction is wrong by the same. Fitted to 3000
+#: points on 205 simulated roads, before the share of sigma that a tracker claims.
 _PLACE_CM, _SLOPE, _ALIKE_CM = 0.5, 0.055, 0.8
 #: The same while nobody tells how the car moves: more than what counts as known.
 _UNTOLD_CM = 100.0
