@@ -142,30 +142,58 @@ def test_a_lane_that_the_car_turned_away_from_is_forgotten(motion):
     assert lane.doubts(SIDE_ROAD.reshape(6), WIDTH_CM) is None
 
 
-def test_its_place_is_as_sure_as_before_where_the_car_has_come_back():
+@pytest.mark.parametrize("travel_cm", [20.0, -5.0])
+def test_its_place_is_less_sure_after_driving_on_or_back(travel_cm):
     lane = at_a_junction()
     before_cm = lane.lane()[1]
-    lane.moved(20.0, 0.0, WHEELBASE_CM)
+    lane.moved(travel_cm, 0.0, WHEELBASE_CM)
     assert (lane.lane()[1] > before_cm).all()
-    lane.moved(-20.0, 0.0, WHEELBASE_CM)
-    assert lane.lane()[1] == pytest.approx(before_cm)
 
 
-def test_a_lane_that_was_plain_half_a_metre_ago_is_not_continued():
+def test_its_place_is_as_sure_however_often_its_motion_is_told():
+    sigmas_cm = []
+    for steps in (1, 20):
+        lane = at_a_junction()
+        for _ in range(steps):
+            lane.moved(40.0 / steps, 0.0, WHEELBASE_CM)
+        sigmas_cm.append(lane.lane()[1])
+    assert sigmas_cm[0] == pytest.approx(sigmas_cm[1])
+
+
+def test_a_lane_that_the_car_has_turned_in_is_less_sure_along_the_row():
+    straight, turned = at_a_junction(), at_a_junction()
+    for _ in range(10):
+        straight.moved(4.0, 0.0, WHEELBASE_CM)
+        turned.moved(4.0, 0.05, WHEELBASE_CM)
+    assert (turned.lane()[1] > 1.05 * straight.lane()[1]).all()
+
+
+def test_a_lane_that_is_plain_again_is_as_sure_as_at_first():
+    lane = in_a_lane()
+    lane.moved(40.0, 0.0, WHEELBASE_CM)
+    lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    for _ in range(2):
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+    assert lane.lane()[1] == pytest.approx(at_a_junction().lane()[1])
+
+
+def test_a_lane_that_was_plain_half_a_metre_ago_is_not_continued_but_still_tells_what_is_doubtful():
     lanes = in_a_lane(), in_a_lane()
     for lane, travel_cm in zip(lanes, (40.0, 50.0), strict=True):
         lane.moved(travel_cm, 0.0, WHEELBASE_CM)
         for _ in range(2):
             lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+        doubted = lane.doubts(SIDE_ROAD.reshape(6), WIDTH_CM)
+        assert doubted is not None and doubted.tolist() == [False, False, True, False, True, True]
     assert [lane.on for lane in lanes] == [True, False]
 
 
-def test_however_long_a_line_was_suspected_one_plain_frame_is_half_of_the_way_back():
+def test_however_long_a_line_was_suspected_two_plain_frames_clear_it():
     lane = in_a_lane()
     lane.moved(50.0, 0.0, WHEELBASE_CM)
     for _ in range(20):
         lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
-    for _ in range(3):
+    for _ in range(2):
         lane.look(seen(LANE), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
     for _ in range(2):
         assert not lane.on
@@ -182,7 +210,7 @@ def test_it_turns_to_where_the_lane_is_seen_ahead():
     lane = at_a_junction()
     lane.moved(50.0, 0.0, WHEELBASE_CM)
     before_cm = lane.lane()[1]
-    lane.anchor(ahead(8.0, 75.0), WIDTH_CM)
+    lane.anchor(ahead(8.0, 75.0))
     points_cm, sigma_cm = lane.lane()
     middle_cm = points_cm.mean(axis=0)
     slope = (middle_cm[2] - middle_cm[0]) / 30.0
@@ -196,13 +224,14 @@ def test_it_turns_to_where_the_lane_is_seen_ahead():
 def test_sigma_is_that_of_the_least_squares_fit():
     lane, y_cm = at_a_junction(), np.array([45.0, 60.0, 75.0])
     lane.moved(30.0, 0.0, WHEELBASE_CM)
-    slope = np.array([[1.0, 30.0], [0.0, 1.0]])
-    before = slope @ np.diag([0.5**2, 0.055**2]) @ slope.T + np.diag([0.0, 0.1**2])
-    lane.anchor(ahead(2.0, *y_cm), WIDTH_CM)
+    way = np.array([[1.0, 30.0], [0.0, 1.0]])
+    bends = 0.0107**2 * np.array([[30.0**3 / 3.0, 30.0**2 / 2.0], [30.0**2 / 2.0, 30.0]])
+    before = way @ np.diag([0.57**2, 0.01**2]) @ way.T + bends + np.diag([0.0, 0.1**2])
+    lane.anchor(ahead(2.0, *y_cm))
     seen_at = np.column_stack([np.ones(3), y_cm])
     after = np.linalg.inv(np.linalg.inv(before) + seen_at.T @ seen_at)
     rows = np.column_stack([np.ones(3), [0.0, 15.0, 30.0]])
-    expected_cm = np.sqrt(np.diag(rows @ after @ rows.T) + 0.8**2)
+    expected_cm = np.sqrt(np.diag(rows @ after @ rows.T))
     assert lane.lane()[1] == pytest.approx(np.tile(expected_cm, (2, 1)))
 
 
@@ -210,7 +239,7 @@ def test_a_lane_that_is_seen_ahead_is_continued_no_further_than_another():
     lane = at_a_junction()
     for _ in range(9):
         lane.moved(20.0, 0.0, WHEELBASE_CM)
-        lane.anchor(ahead(0.0, 45.0, 60.0), WIDTH_CM)
+        lane.anchor(ahead(0.0, 45.0, 60.0))
     lane.look_for_its_end(seen(SIDE_ROAD, left_cm=0.0), found=False, width_cm=WIDTH_CM)
     assert not lane.on
 
@@ -220,7 +249,7 @@ def test_the_more_of_it_is_seen_ahead_the_less_counts_the_way_to_there():
     for y_cm in ([75.0], [45.0, 60.0, 75.0]):
         lane = at_a_junction()
         lane.moved(80.0, 0.0, WHEELBASE_CM)
-        lane.anchor(ahead(8.0, *y_cm), WIDTH_CM)
+        lane.anchor(ahead(8.0, *y_cm))
         beside_cm.append(lane.lane()[0].mean(axis=0)[0])
     assert 0.0 < beside_cm[0] < 4.0 < beside_cm[1] < 8.0
 
@@ -228,9 +257,41 @@ def test_the_more_of_it_is_seen_ahead_the_less_counts_the_way_to_there():
 def test_a_lane_that_leads_to_another_place_beside_the_car_is_another_one():
     lane = at_a_junction()
     lane.moved(50.0, 0.0, WHEELBASE_CM)
-    before_cm = lane.lane()[0]
-    lane.anchor(ahead(15.0, 45.0, 60.0, 75.0), WIDTH_CM)
-    assert lane.lane()[0] == pytest.approx(before_cm)
+    before_cm, before_sigma_cm = lane.lane()
+    lane.anchor(ahead(15.0, 45.0, 60.0, 75.0))
+    assert lane.lane()[0] == pytest.approx(before_cm) and lane.lane()[1] == pytest.approx(before_sigma_cm)
+
+
+def test_a_car_that_stands_learns_nothing_from_seeing_it_again():
+    lane = at_a_junction()
+    lane.moved(60.0, 0.0, WHEELBASE_CM)
+    lane.anchor(ahead(4.0, 45.0, 60.0, 75.0))
+    before_cm, before_sigma_cm = lane.lane()
+    lane.moved(0.5, 0.0, WHEELBASE_CM)
+    lane.anchor(ahead(4.0, 45.0, 60.0, 75.0))
+    assert lane.lane()[0] == pytest.approx(before_cm, abs=0.1)
+    assert (lane.lane()[1] > 0.99 * before_sigma_cm).all()
+
+
+def test_its_width_is_what_was_seen_of_it():
+    lane = StraightOn()
+    lane.moved(0.0, 0.0, WHEELBASE_CM)
+    wider = LANE + np.array([[-2.0], [2.0]])
+    lane.look(seen(wider), leaving=None, presence=BOTH, width_cm=WIDTH_CM)
+    for _ in range(2):
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+    lane.moved(10.0, 0.0, WHEELBASE_CM)
+    lane.anchor(ahead(0.0, 45.0, 60.0, 75.0))
+    assert lane.lane()[0] == pytest.approx(wider)
+
+
+def test_a_lane_is_forgotten_by_a_reset():
+    lane = at_a_junction()
+    lane.reset()
+    assert not lane.on and not lane.told
+    for _ in range(3):
+        lane.look(seen(SIDE_ROAD, left_cm=0.0), leaving=1, presence=RIGHT, width_cm=WIDTH_CM)
+    assert not lane.on
 
 
 def test_it_ends_when_one_line_is_where_it_is_expected():
@@ -297,22 +358,26 @@ def drive_into_a_side_road(
     other_border: bool = False,
     straight_border: bool = False,
     mirrored: bool = False,
+    told: bool = True,
+    plain_frames: int = 12,
 ) -> tuple[LaneTracker, np.ndarray]:
     """The right line turns away 20 cm ahead; the left one goes on in parallel, or has ended.
 
     The road's other border, beyond a second lane to the left, may go on in parallel as well. Mirrored, the
-    left line turns away.
+    left line turns away. Before, the lane is plain for some frames.
     """
     tracker = LaneTracker(LaneMemory(WIDTH_CM), view=CameraView(example_camera()))
     y = np.arange(-5.0, 46.0, 1.0)
     straight = borders_of({0: np.full_like(y, -20.0), 1: np.full_like(y, 20.0)})
     sigma_cm, certain = np.full(6, 0.8), np.ones(2)
-    for _ in range(12):
-        tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
+    for _ in range(plain_frames):
+        if told:
+            tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
         tracker.follow(LANE.reshape(6), sigma_cm, certain, straight)
     radius_cm, found_cm = 45.0, np.empty(6)
     for step in range(6):
-        tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
+        if told:
+            tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
         ahead = np.maximum(y - 18.0 + 3.0 * step, 0.0)
 
         def bend(radius_cm: float, ahead: np.ndarray = ahead) -> np.ndarray:
@@ -355,6 +420,17 @@ def test_the_tracker_goes_to_where_it_sees_the_lane_beyond_a_junction():
     assert after_cm[2] > 4.0 and after_cm[0] + 2.0 * (after_cm[2] - after_cm[0]) == pytest.approx(
         10.0, abs=1.5
     )
+
+
+@pytest.mark.parametrize(("told", "plain_frames"), [(False, 12), (True, 4)])
+def test_without_the_cars_motion_or_what_markings_look_like_the_tracker_does_not_look_beyond(
+    told, plain_frames
+):
+    tracker, _ = drive_into_a_side_road(goes_on=False, told=told, plain_frames=plain_frames)
+    assert tracker.straight_on.on and tracker.straight_on.told == told
+    tracker.follow(LANE.reshape(6), np.full(6, 5.0), np.zeros(2), beyond_a_junction(10.0))
+    assert tracker.straight_on.on
+    assert tracker.straight_on.lane()[0] == pytest.approx(LANE, abs=1.0)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

@@ -25,9 +25,9 @@ _TURNS, _TURNS_STILL, _AFTER = (7.0, 0.15), (5.0, 0.12), 2
 _DOUBTED = 0.08
 #: A lane is plain whose lines are both seen in this length, [cm], have its width within this share beside the
 #: car and 15 cm ahead, and turn by less than this one. It is worth continuing for so many frames, with and
-#: without knowing the car's motion, and for this distance, [cm]. Chosen: of 44 continued lanes on 205
-#: simulated roads two were 5 cm off at once, plain 51 and 66 cm before; of the others, which are not, all but
-#: one 36 at most.
+#: without knowing the car's motion, and begins to be within this distance, [cm]. Chosen: of 44 continued
+#: lanes on 205 simulated roads two were 5 cm off at once, which had been plain 51 and 66 cm before; the
+#: others, which were not, 36 cm at most, but for one.
 _PLAIN_CM, _PLAIN_WIDTH, _PLAIN_TURN, _FRESH, _FRESH_UNTOLD, _FRESH_CM = 9.0, 0.12, 0.12, 25, 6, 45.0
 #: A line is the lane's again if it is seen in this length, [cm], and if it is within this share of the width
 #: of where it is expected, and turns away by less than this one. Chosen.
@@ -44,15 +44,16 @@ _ENDED, _LONG, _RECENT = 0.62, 4, 6
 #: Tried: 12, 16 and 20 pass two, three and three of three mouths of side roads in glare; with no limit, 0.6 %
 #: of the points of `garage_tape` are lost.
 _SPECK_CM = 20.0
-#: Sigma of a plain lane's middle beside the car, [cm], and of its slope, dx/dy; what is added to the sigma
-#: that is told, [cm], since what consecutive frames show of a junction is wrong by the same. Fitted to 3000
-#: points on 205 simulated roads, before the share of sigma that a tracker claims.
-_PLACE_CM, _SLOPE, _ALIKE_CM = 0.5, 0.055, 0.8
+#: Sigma of a plain lane's middle beside the car, [cm], and of its slope, dx/dy; and of what the slope changes
+#: by per root of a centimetre, since lanes bend. Fitted to 2046 points on 205 simulated roads, before the
+#: share of sigma that a tracker claims; the second one, which they leave open, is chosen.
+_PLACE_CM, _SLOPE, _BENDS = 0.57, 0.01, 0.0107
 #: The same while nobody tells how the car moves: more than what counts as known.
 _UNTOLD_CM = 100.0
-#: Where the lane is seen again ahead: by how much its slope may differ beyond the junction, as a sigma; sigma
-#: of the points ahead; beyond how many sigmas beside the car it is another lane. Chosen: roads bend.
-_BENT, _SEEN_AHEAD_CM, _MOST_SIGMAS = 0.1, 1.0, 2.0
+#: Where the lane is seen again ahead: by how much the direction to there may differ from the lane's slope
+#: here, as a sigma; sigma of the points ahead; beyond how many sigmas beside the car it is another lane; how
+#: far the car drives at least until that counts again, since a car that stands sees the same again. Chosen.
+_BENT, _SEEN_AHEAD_CM, _MOST_SIGMAS, _AGAIN_CM = 0.1, 1.0, 2.0, 2.0
 #: Distance and frames after which it is given up. Chosen: a junction of four lanes; 2 s at 20 frames/s.
 _FARTHEST_CM, _LONGEST = 160.0, 40
 #: A car that stands across a lane at a larger slope, cm beside per cm ahead, has left it. Chosen: 45 degrees.
@@ -89,7 +90,7 @@ class StraightOn:
 
     Attributes:
         on: Whether the lane is continued at present.
-        told: Whether the car's motion is known: without it, the continued lane's place is unknown.
+        told: Whether the car's motion has been told: without it, the continued lane's place is unknown.
         leaving: The line that turns away, or did so a few frames ago while the other one vanished; 0 for the
             left one, None for neither. Where the lane is continued, the one that left it.
     """
@@ -106,7 +107,7 @@ class StraightOn:
         #: Of the middle's x beside the car, [cm], and of its slope.
         self._covariance: Float[np.ndarray, "2 2"] = np.zeros((2, 2))
         self._frames = 0
-        self._driven_cm = 0.0
+        self._driven_cm = self._driven_since_anchor_cm = 0.0
         self.forget_turn()
 
     def forget_turn(self) -> None:
@@ -125,7 +126,8 @@ class StraightOn:
         if self._lines_cm is None:
             return
         self._driven_cm += abs(travel_cm)
-        half_rad = 0.5 * turn_rad
+        self._driven_since_anchor_cm += abs(travel_cm)
+        half_rad, before = 0.5 * turn_rad, _slope(self._lines_cm)
         pose = np.array([travel_cm * math.cos(half_rad), travel_cm * math.sin(half_rad), turn_rad])
         for line_cm in self._lines_cm:
             ends_cm = map_from_car(np.column_stack([line_cm, _ROWS])[[0, -1]], np.zeros(3), wheelbase_cm)
@@ -136,8 +138,13 @@ class StraightOn:
                 self.forget_turn()
                 return
             line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
-        driven = np.array([[1.0, travel_cm], [0.0, 1.0]])
-        self._covariance = driven @ self._covariance @ driven.T
+        # With the car the slope's scale turns, too: it is the tangent of an angle.
+        scale = math.sqrt((1.0 + _slope(self._lines_cm) ** 2) / (1.0 + before**2))
+        driven = scale * np.array([[1.0, travel_cm], [0.0, scale]])
+        # What a slope that walks at random makes of it on the way.
+        d = abs(travel_cm)
+        bends = _BENDS**2 * np.array([[d**3 / 3.0, d * travel_cm / 2.0], [d * travel_cm / 2.0, d]])
+        self._covariance = driven @ self._covariance @ driven.T + bends
 
     def turns_away(
         self, points_cm: Sequence[float], seen_at: Sequence[bool], side: int, width_cm: float
@@ -189,7 +196,7 @@ class StraightOn:
             self._suspicious = min(self._suspicious + 1, _AFTER)
         else:
             self.leaving = leaving
-            # A frame that shows neither line well says nothing against it.
+            # A frame that does not show both lines well says nothing against it.
             if min(lines.seen_cm) >= _PLAIN_CM:
                 self._suspicious = max(0, self._suspicious - 1)
         self._frames += 1
@@ -201,10 +208,10 @@ class StraightOn:
             ahead_cm = [slope * (row - ROWS_CM[_MIDDLE]) for row in ROWS_CM]
             self._lines_cm = np.array([[x[_MIDDLE] + dx for dx in ahead_cm] for x in (left, right)])
             self._covariance = np.diag([_PLACE_CM**2, _SLOPE**2])
-            self._driven_cm, self._frames = 0.0, 0
-        elif self._frames > (_FRESH if self.told else _FRESH_UNTOLD) or self._driven_cm > _FRESH_CM:
+            self._driven_cm, self._driven_since_anchor_cm, self._frames = 0.0, _AGAIN_CM, 0
+        elif self._frames > (_FRESH if self.told else _FRESH_UNTOLD):
             self._lines_cm = None
-        if self._suspicious >= _AFTER and self._lines_cm is not None:
+        if self._suspicious >= _AFTER and self._lines_cm is not None and self._driven_cm <= _FRESH_CM:
             self.on, self._suspicious, self._frames = True, 0, 0
 
     def _recently_leaving(self, leaving: int | None) -> int | None:
@@ -225,29 +232,30 @@ class StraightOn:
         vanishes = 0 < self._unseen[side] < _RECENT
         return vanishes and (presence[side] < _ENDED or self._turning >= _LONG)
 
-    def anchor(self, middle_cm: Float[np.ndarray, "k 2"], width_cm: float) -> None:
-        """Turn the continued lane to where it is seen further ahead, by least squares.
+    def anchor(self, middle_cm: Float[np.ndarray, "k 2"]) -> None:
+        """Turn the continued lane to where it is seen further ahead: the update of a Kalman filter.
 
-        A lane that leads to another place beside the car is another one.
+        A lane that leads to another place beside the car is another one, and changes nothing.
 
         Args:
             middle_cm: Points in the middle of the lane there, frame car.
-            width_cm: The lane's width.
         """
         assert self._lines_cm is not None
-        near_cm, far_cm = self._lines_cm.mean(axis=0)[[0, -1]]
-        expected = np.array([near_cm, (far_cm - near_cm) / (_ROWS[-1] - _ROWS[0])])
+        if self._driven_since_anchor_cm < _AGAIN_CM:
+            return
+        before_cm, before = float(self._lines_cm[:, 0].mean()), _slope(self._lines_cm)
         covariance = self._covariance + np.diag([0.0, _BENT**2])
-        # A Kalman filter's update.
         seen = np.column_stack([np.ones(len(middle_cm)), middle_cm[:, 1]])
         spread = seen @ covariance @ seen.T + _SEEN_AHEAD_CM**2 * np.eye(len(seen))
         gain = np.linalg.solve(spread, seen @ covariance).T
+        expected = np.array([before_cm, before])
         start_cm, slope = expected + gain @ (middle_cm[:, 0] - seen @ expected)
-        if abs(start_cm - near_cm) > _MOST_SIGMAS * math.sqrt(covariance[0, 0]):
+        if abs(start_cm - before_cm) > _MOST_SIGMAS * math.sqrt(covariance[0, 0]):
             return
-        half_cm = 0.5 * width_cm * math.hypot(1.0, slope)
-        self._lines_cm = np.array([[-half_cm], [half_cm]]) + start_cm + slope * (_ROWS - _ROWS[0])
-        self._covariance = covariance - gain @ seen @ covariance
+        # Along the row a lane is the wider, the more it leans.
+        aside_cm = (self._lines_cm[:, :1] - before_cm) * math.sqrt((1.0 + slope**2) / (1.0 + before**2))
+        self._lines_cm = aside_cm + start_cm + slope * (_ROWS - _ROWS[0])
+        self._covariance, self._driven_since_anchor_cm = covariance - gain @ seen @ covariance, 0.0
 
     def look_for_its_end(self, lines: SeenLines, found: bool, width_cm: float) -> None:
         """Take a frame while the lane is continued.
@@ -289,10 +297,15 @@ class StraightOn:
         """Return the continued lines and their sigmas, very large ones while the car's motion is unknown."""
         assert self._lines_cm is not None
         rows = np.column_stack([np.ones_like(_ROWS), _ROWS])
-        sigma_cm = np.hypot(np.sqrt(np.einsum("ri,ij,rj->r", rows, self._covariance, rows)), _ALIKE_CM)
+        sigma_cm = np.sqrt(np.einsum("ri,ij,rj->r", rows, self._covariance, rows))
         if not self.told:
             sigma_cm = np.full(len(_ROWS), _UNTOLD_CM)
         return self._lines_cm.copy(), np.tile(sigma_cm, (2, 1))
+
+
+def _slope(lines_cm: Float[np.ndarray, "2 3"]) -> float:
+    """Return dx/dy of straight lines."""
+    return float(lines_cm[0, -1] - lines_cm[0, 0]) / (ROWS_CM[-1] - ROWS_CM[0])
 
 
 def _is_plain(lines: SeenLines, width_cm: float) -> bool:

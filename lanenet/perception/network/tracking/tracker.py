@@ -424,7 +424,10 @@ class LaneTracker:
         return self.straight_on.on
 
     def _look_beyond(self, width_cm: float, edges: RoadEdges) -> None:
-        """Turn the continued lane to where both of its lines are seen further ahead."""
+        """Turn the continued lane to where both of its lines are seen further ahead.
+
+        That needs the car's motion, and how wide the markings are.
+        """
         markings_cm = [self._markings.usual_cm(side) for side in range(len(SIDES))]
         known_cm = [marking_cm for marking_cm in markings_cm if marking_cm is not None]
         if not self.straight_on.told or len(known_cm) < len(SIDES):
@@ -432,7 +435,7 @@ class LaneTracker:
         continued_cm, _ = self.straight_on.lane()
         beyond_cm = lane_beyond(continued_cm, width_cm, known_cm, edges)
         if beyond_cm is not None:
-            self.straight_on.anchor(beyond_cm, width_cm)
+            self.straight_on.anchor(beyond_cm)
 
     def _turning(self, pair: Pair, width_cm: float, borders: RoadBorders) -> tuple[bool, int | None]:
         """Return whether the lines turn together, or which one does alone."""
