@@ -435,7 +435,7 @@ class LaneTracker:
         continued_cm, _ = self.straight_on.lane()
         beyond_cm = lane_beyond(continued_cm, width_cm, known_cm, edges)
         if beyond_cm is not None:
-            self.straight_on.anchor(beyond_cm)
+            self.straight_on.anchor(beyond_cm, width_cm)
 
     def _turning(self, pair: Pair, width_cm: float, borders: RoadBorders) -> tuple[bool, int | None]:
         """Return whether the lines turn together, or which one does alone."""
