@@ -200,7 +200,8 @@ def test_make_trains_the_general_network_with_the_real_drives_of_a_library(tmp_p
     assert found == [("hall", "MIT", "train", 0.3), ("yard", "CC0-1.0", "train", 0.3)]
 
 
-#: The others are trained by `make chain`, a stage of the gate.
+#: The others are trained by `make chain`, a stage of the gate, but for alexnet.yaml: its network is that of
+#: paper_split.yaml, too.
 FAST = ("small.yaml",)
 
 
