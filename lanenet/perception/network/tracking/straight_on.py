@@ -108,7 +108,7 @@ class StraightOn:
         #: Of the middle's x beside the car, [cm], and of its slope.
         self._covariance: Float[np.ndarray, "2 2"] = np.zeros((2, 2))
         self._frames = 0
-        self._driven_cm = self._driven_since_anchor_cm = 0.0
+        self._driven_cm, self._driven_since_anchor_cm = 0.0, math.inf
         self.forget_turn()
 
     def forget_turn(self) -> None:
@@ -209,7 +209,7 @@ class StraightOn:
             ahead_cm = [slope * (row - ROWS_CM[_MIDDLE]) for row in ROWS_CM]
             self._lines_cm = np.array([[x[_MIDDLE] + dx for dx in ahead_cm] for x in (left, right)])
             self._covariance = np.diag([_PLACE_CM**2, _SLOPE**2])
-            self._driven_cm, self._driven_since_anchor_cm, self._frames = 0.0, _AGAIN_CM, 0
+            self._driven_cm, self._driven_since_anchor_cm, self._frames = 0.0, math.inf, 0
         elif self._frames > (_FRESH if self.told else _FRESH_UNTOLD):
             self._lines_cm = None
         if self._suspicious >= _AFTER and self._lines_cm is not None and self._driven_cm <= _FRESH_CM:
@@ -297,9 +297,10 @@ class StraightOn:
     def lane(self) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
         """Return the continued lines and their sigmas, very large ones while the car's motion is unknown."""
         assert self._lines_cm is not None
-        rows = np.column_stack([np.ones_like(_ROWS), _ROWS])
-        sigma_cm = np.hypot(np.sqrt(np.einsum("ri,ij,rj->r", rows, self._covariance, rows)), _ALIKE_CM)
-        if not self.told:
+        if self.told:
+            rows = np.column_stack([np.ones_like(_ROWS), _ROWS])
+            sigma_cm = np.hypot(np.sqrt(np.einsum("ri,ij,rj->r", rows, self._covariance, rows)), _ALIKE_CM)
+        else:
             sigma_cm = np.full(len(_ROWS), _UNTOLD_CM)
         return self._lines_cm.copy(), np.tile(sigma_cm, (2, 1))
 
