@@ -36,6 +36,8 @@ class LaneEstimate:
             know it.
         own_lane: Probability that it is the lane to drive in, not the next one; NaN where the detector does
             not know it.
+        centre_line_cm: The lane's centre before, at and beyond a corner that is too sharp for parabolas,
+            [cm], frame car; None elsewhere.
     """
 
     points_cm: Float[np.ndarray, "6"] = field(default_factory=lambda: np.full(N_POINTS, np.nan))
@@ -46,6 +48,7 @@ class LaneEstimate:
     offset_cm: float = float("nan")
     presence: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(len(SIDES), np.nan))
     own_lane: float = float("nan")
+    centre_line_cm: Float[np.ndarray, "3 2"] | None = None
 
     @property
     def mask(self) -> np.ndarray:

@@ -46,6 +46,8 @@ _SEEN_CM = 9.0
 #: Presence that counts of lines that are continued over a junction. Chosen: the car goes on, and slower,
 #: since a bend whose outer line is worn off looks like a junction.
 _CONTINUED = 0.3
+#: The same around a sharp corner, of which both lines were seen. Chosen.
+_AROUND_CORNER = 0.5
 #: Label row at which the car aims, 15 cm ahead.
 _AIM = 1
 
@@ -128,7 +130,9 @@ class NetworkDetector:
             self._told = True
             self.problems.append(contradiction)
             log.warning(contradiction)
-        if self._tracker.straight_on.on:
+        if self._tracker.corner.on:
+            presence = confirmed = np.full_like(presence, _AROUND_CORNER)
+        elif self._tracker.straight_on.on:
             presence = confirmed = np.full_like(presence, _CONTINUED)
         else:
             # Plain numbers: for two of them arrays cost more than they save.
@@ -168,6 +172,7 @@ class NetworkDetector:
         """Return the answer; ``confirmed`` is the presence that the confidence counts."""
         width_cm = self.memory.width_cm
         aim_cm = _centre_cm(points_cm, width_cm)
+        corner = self._tracker.corner
         return LaneEstimate(
             points_cm=points_cm,
             sigma_cm=sigma_cm,
@@ -175,11 +180,12 @@ class NetworkDetector:
             confidence=confidence(points_cm, sigma_cm, confirmed, self.meta.widths_cm, width_cm),
             presence=presence,
             own_lane=self._tracker.looks.own_lane,
+            centre_line_cm=corner.corner.line_cm(0.0) if corner.on and corner.corner is not None else None,
         )
 
     def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
         """Take the car's motion since the last frame; as :class:`lanenet.perception.estimate.TakesMotion`."""
-        self._tracker.straight_on.moved(travel_cm, turn_rad, wheelbase_cm)
+        self._tracker.moved(travel_cm, turn_rad, wheelbase_cm)
 
     def reset(self) -> None:
         """Forget the lane and its markings; its width stays likely, since most roads stay the same."""

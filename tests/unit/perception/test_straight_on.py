@@ -360,12 +360,12 @@ def drive_into_a_side_road(
     sigma_cm, certain = np.full(6, 0.8), np.ones(2)
     for _ in range(plain_frames):
         if told:
-            tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
+            tracker.moved(3.0, 0.0, WHEELBASE_CM)
         tracker.follow(LANE.reshape(6), sigma_cm, certain, straight)
     radius_cm, found_cm = 45.0, np.empty(6)
     for step in range(6):
         if told:
-            tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
+            tracker.moved(3.0, 0.0, WHEELBASE_CM)
         ahead = np.maximum(y - 18.0 + 3.0 * step, 0.0)
 
         def bend(radius_cm: float, ahead: np.ndarray = ahead) -> np.ndarray:
@@ -401,7 +401,7 @@ def test_the_tracker_goes_to_where_it_sees_the_lane_beyond_a_junction():
     tracker, found_cm = drive_into_a_side_road(goes_on=False)
     before_cm = found_cm.reshape(2, 3).mean(axis=0)
     for _ in range(4):
-        tracker.straight_on.moved(3.0, 0.0, WHEELBASE_CM)
+        tracker.moved(3.0, 0.0, WHEELBASE_CM)
         found_cm = tracker.follow(LANE.reshape(6), np.full(6, 5.0), np.zeros(2), beyond_a_junction(10.0))[0]
     after_cm = found_cm.reshape(2, 3).mean(axis=0)
     assert tracker.straight_on.on and before_cm == pytest.approx(np.zeros(3), abs=1.0)

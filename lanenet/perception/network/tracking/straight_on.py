@@ -111,6 +111,26 @@ class StraightOn:
         self._driven_cm, self._driven_since_anchor_cm = 0.0, math.inf
         self.forget_turn()
 
+    @property
+    def expected_cm(self) -> Float[np.ndarray, "2 3"] | None:
+        """Where the last plain lane's lines are if it goes straight on: x at the label rows, or None."""
+        return self._lines_cm
+
+    def start_again(self, lines_cm: Float[np.ndarray, "2 3"]) -> None:
+        """Take a straight lane as a plain one, by x of its lines at the label rows."""
+        self.forget_lane()
+        self._lines_cm = lines_cm.copy()
+        self._know_it()
+
+    def forget_lane(self) -> None:
+        """Forget the lane: it does not go straight on."""
+        self.on, self._lines_cm = False, None
+        self.forget_turn()
+
+    def _know_it(self) -> None:
+        self._covariance = np.diag([_PLACE_CM**2, _SLOPE**2])
+        self._driven_cm, self._driven_since_anchor_cm, self._frames = 0.0, math.inf, 0
+
     def forget_turn(self) -> None:
         """Forget that a line turned away: the lane bends, or the junction is behind the car."""
         self._suspicious = 0
@@ -135,8 +155,7 @@ class StraightOn:
             (x_0, y_0), (x_1, y_1) = car_from_map(ends_cm, pose, wheelbase_cm)
             # Not a number where the motion is none.
             if not abs(x_1 - x_0) <= _STEEPEST * (y_1 - y_0):
-                self.on, self._lines_cm = False, None
-                self.forget_turn()
+                self.forget_lane()
                 return
             line_cm[:] = x_0 + (_ROWS - y_0) * (x_1 - x_0) / (y_1 - y_0)
         # With the car the slope's scale turns, too: it is the tangent of an angle.
@@ -208,8 +227,7 @@ class StraightOn:
             slope = 0.5 * (left[far] - left[0] + (right[far] - right[0])) / ROWS_CM[far]
             ahead_cm = [slope * (row - ROWS_CM[_MIDDLE]) for row in ROWS_CM]
             self._lines_cm = np.array([[x[_MIDDLE] + dx for dx in ahead_cm] for x in (left, right)])
-            self._covariance = np.diag([_PLACE_CM**2, _SLOPE**2])
-            self._driven_cm, self._driven_since_anchor_cm, self._frames = 0.0, math.inf, 0
+            self._know_it()
         elif self._frames > (_FRESH if self.told else _FRESH_UNTOLD):
             self._lines_cm = None
         if self._suspicious >= _AFTER and self._lines_cm is not None and self._driven_cm <= _FRESH_CM:
@@ -270,8 +288,7 @@ class StraightOn:
         self._frames += 1
         too_long = self._frames > _LONGEST or self._driven_cm > _FARTHEST_CM
         if too_long or found or self._are_the_lanes(lines, self._lines_cm, width_cm):
-            self.on, self._lines_cm = False, None
-            self.forget_turn()
+            self.forget_lane()
 
     @staticmethod
     def _are_the_lanes(lines: SeenLines, expected_cm: Float[np.ndarray, "2 3"], width_cm: float) -> bool:

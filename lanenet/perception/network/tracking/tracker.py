@@ -23,6 +23,7 @@ from lanenet.perception.network.refinement import RoadBorders, refined
 from lanenet.perception.network.tracking.camera_view import CameraView
 from lanenet.perception.network.tracking.lane_belief import Keep, LineLooks
 from lanenet.perception.network.tracking.lane_beyond import lane_beyond
+from lanenet.perception.network.tracking.lane_corner import CornerAhead, find_corner
 from lanenet.perception.network.tracking.line_beside import SeenLine, WidthHere, line_beside
 from lanenet.perception.network.tracking.marking_widths import MarkingWidths
 from lanenet.perception.network.tracking.pair import Candidate, Pair, best_pair, tells_width
@@ -148,6 +149,7 @@ class LaneTracker:
         self._rival: Pair | None = None
         self._which_lane = WhichLane()
         self.straight_on = StraightOn()
+        self.corner = CornerAhead()
         self._view = view
         self._markings = MarkingWidths()
         self._width_here = WidthHere()
@@ -157,6 +159,7 @@ class LaneTracker:
         self._last = self._rival = None
         self._which_lane.reset()
         self.straight_on.reset()
+        self.corner.reset()
         self.looks.reset()
         self._width_here.reset()
         self._markings.reset()
@@ -180,10 +183,12 @@ class LaneTracker:
             Points and sigmas, NaN where the place is unknown, and the length along the road in which each
             line was seen, [cm].
         """
+        borders = RoadBorders(edges)
+        if self._at_corner(borders):
+            return self._around_corner()
         network_cm = points_cm.tolist()
         own = _both(network_cm), _both([_NETWORK_SIGMA * each_cm for each_cm in sigma_cm.tolist()])
         present = presence.tolist()
-        borders = RoadBorders(edges)
         starts, measured = self._starts(own, present), self._to_measure(own, present)
         # In one go, since each look at the edge points has a price.
         found = self._refine([*starts, *measured], borders)
@@ -239,6 +244,11 @@ class LaneTracker:
         elif not self._which_lane.find(on_edges):
             known_cm[:] = known_sigma_cm[:] = math.nan
         return known_cm, known_sigma_cm, np.array([left.seen_cm, right.seen_cm])
+
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`."""
+        self.straight_on.moved(travel_cm, turn_rad, wheelbase_cm)
+        self.corner.moved(travel_cm, turn_rad, wheelbase_cm)
 
     def lose(self) -> None:
         """Take a frame that shows nothing of the lane."""
@@ -401,6 +411,55 @@ class LaneTracker:
                 starts.append(_Start(*beyond, beyond=True))
         return starts
 
+    def _at_corner(self, borders: RoadBorders) -> bool:
+        """Return whether the lane turns at once here.
+
+        That needs the car's motion, and how wide the markings are.
+        """
+        width_cm, markings_cm = self.lane.width_cm, self._known_markings_cm()
+        if width_cm is None or markings_cm is None or not self.straight_on.told:
+            self.corner.reset()
+            return False
+        if self.corner.on:
+            goes_on = self.corner.follow(markings_cm, borders.edges)
+            if not goes_on:
+                self._leave_corner()
+            return goes_on
+        lines_cm, found = self.straight_on.expected_cm, None
+        if lines_cm is not None and not self.straight_on.on:
+            hints = corners(lines_cm.tolist(), markings_cm, borders)
+            found = find_corner(lines_cm, width_cm, markings_cm, hints, borders.edges)
+        self.corner.look(found)
+        return self.corner.on
+
+    def _around_corner(
+        self,
+    ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
+        """Answer with the lane that turns at once."""
+        self.straight_on.forget_lane()
+        self._last = self._rival = None
+        self._width_here.look(None)
+        points_cm, sigma_cm = self.corner.lane()
+        doubt_cm = np.hypot(sigma_cm, _LABEL_CM)
+        known = doubt_cm <= _MOST_LANES * self.lane.likely_cm
+        self._which_lane.keep(True)
+        answer = np.where(known, points_cm, np.nan), np.where(known, _CLAIMED * doubt_cm, np.nan)
+        return answer[0].ravel(), answer[1].ravel(), np.zeros(len(SIDES))
+
+    def _leave_corner(self) -> None:
+        """Look for the lane beyond a corner where that was seen last."""
+        lines_cm = self.corner.lane_beyond()
+        if lines_cm is not None:
+            self._last = lines_cm.tolist(), [list(_MOVED_CM)] * len(SIDES)
+            self.straight_on.start_again(lines_cm)
+        self.corner.reset()
+
+    def _known_markings_cm(self) -> list[float] | None:
+        """Return how wide the lines' markings are; None before both are known."""
+        usual_cm = [self._markings.usual_cm(side) for side in range(len(SIDES))]
+        known_cm = [marking_cm for marking_cm in usual_cm if marking_cm is not None]
+        return known_cm if len(known_cm) == len(SIDES) else None
+
     def _at_junction(self, pair: Pair, presence: list[float], borders: RoadBorders) -> bool:
         """Return whether the lines that the frame shows are not those of the lane, which goes straight on."""
         width_cm = self.lane.width_cm
@@ -428,12 +487,11 @@ class LaneTracker:
 
         That needs the car's motion, and how wide the markings are.
         """
-        markings_cm = [self._markings.usual_cm(side) for side in range(len(SIDES))]
-        known_cm = [marking_cm for marking_cm in markings_cm if marking_cm is not None]
-        if not self.straight_on.told or len(known_cm) < len(SIDES):
+        markings_cm = self._known_markings_cm()
+        if not self.straight_on.told or markings_cm is None:
             return
         continued_cm, _ = self.straight_on.lane()
-        beyond_cm = lane_beyond(continued_cm, width_cm, known_cm, edges)
+        beyond_cm = lane_beyond(continued_cm, width_cm, markings_cm, edges)
         if beyond_cm is not None:
             self.straight_on.anchor(beyond_cm, width_cm)
 

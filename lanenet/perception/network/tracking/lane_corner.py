@@ -1,0 +1,397 @@
+"""A sharp corner of the lane: both of its lines turn there, and the car is led around it.
+
+At the label rows the inner line of such a corner has turned away, out of view beside the car, while the outer
+one still goes straight on. So the corner is looked for where both are seen to turn, further ahead, and kept
+beside the car's own motion until it lies behind. At a junction one line turns without the other: there the
+outer one does not lead up to the corner and on from it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lanenet.geometry.frames import car_from_map, map_from_car, wrap_angle
+from lanenet.geometry.lane import ROWS_CM, SIDES, rows_of_polyline
+from lanenet.perception.edges.road import RoadEdges
+from lanenet.perception.network.corner import Corner
+
+#: Least angle of a corner, [rad]: the rest are bends, which the lines at the label rows show. On 160 roads of
+#: one seed all of the eleven findings that were more than 4 cm off had been below 37 degrees.
+_LEAST_TURN = math.radians(38.0)
+#: By how much a corner of the lane may turn by more or less than that of a line, [rad]. Chosen.
+_TRIED_TURNS = np.radians([-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0])
+#: What is looked at of the lane before the corner: y along it, [cm], and how far beside it, in widths.
+_NEAR_CM, _FAR_CM, _BESIDE = -15.0, 100.0, 2.0
+#: Length of a piece in which a line is seen or not, [cm]; pieces beyond the corner; and how many places of it
+#: are tried, 1 cm apart across the lane beyond.
+_PIECE_CM, _PIECES, _PLACES = 3.0, 12, 90
+#: A piece counts whole in which both borders of the marking are seen, and this much with one of them. So much
+#: has to be seen beyond the corner of the inner and of the outer line, and of both; of the inner one more
+#: where the corner is beside the car, since stop lines lead to such places. On the roads above, in every
+#: second frame of 52 corners at least two of 34 are found; with 0.3 instead of 0.5 two less.
+_ONE_BORDER, _INNER, _OUTER, _BOTH, _INNER_BESIDE, _BESIDE_CM = 0.5, 2.0, 3.0, 8.0, 4.0, 3.0
+#: The outer line is seen within so much before and after its corner, [cm]. It is none where one of them goes
+#: straight on beyond, over more than so many pieces between these distances. Chosen.
+_AT_CORNER_CM, _BEYOND_CM, _GOES_ON = 9.0, (4.0, 22.0), 3
+#: Where the outer line's corner may be, ahead of the front axle. Chosen.
+_CORNERS_CM = (8.0, 80.0)
+#: A border belongs to a straight line within this distance, at y = 0 and its growth per cm ahead, and from
+#: these cosines on: when looked for and when fitted.
+_NEAR_LINE_CM, _NEAR_LINE_GROWTH, _COSINE, _FIT_COSINE = 2.0, 0.03, 0.9, 0.85
+#: Distances, [cm], up to which borders count when a corner is fitted for the first time, and later those of
+#: the lane before and beyond it; distance that takes half of a border's weight; between which distances from
+#: the corner they count; and the least number of them. Chosen.
+_FIRST_CM, _AGAIN_CM, _CAUCHY_CM = (3.0, 1.5, 1.0), (3.0, 2.0), 0.7
+_CLEAR_CM, _REACH_CM, _LEAST = 2.0, 40.0, 12
+#: Stiffness of a fit: against moving and against turning, and the largest turn at once, [rad]. Chosen.
+_STIFF, _STIFF_TURN, _TURN_AT_ONCE = 1e-3, 50.0, 0.1
+#: Two findings are the same corner within this distance, [cm], and angle, [rad]; one that was found so often
+#: is believed; it begins once the inner line's corner is so near. Chosen: before the last label row is there.
+_SAME_CM, _SAME_TURN, _BELIEVED, _BEGINS_CM = 6.0, 0.2, 2, 36.0
+#: The car is around it once both lines' corners are behind the front axle, and the lane goes on within this
+#: angle. It is given up if nothing of it has been seen over so many cm, ahead and on the way; after so many
+#: in all; where the lane would lead back; and where it has become no corner. Chosen.
+_AROUND, _BACK, _NONE = 0.45, 2.2, 0.5 * _LEAST_TURN
+_UNSEEN_CM, _UNSEEN_ON_THE_WAY_CM, _FARTHEST_CM = 45.0, 60.0, 200.0
+#: Sigma of a line, across it, [cm], and its growth per cm in which nothing of it was seen.
+_SIGMA_CM, _GROWTH = 1.0, 0.04
+#: Points on a line that runs at more than this angle across the car's direction are not answered, [rad].
+_STEEPEST = math.radians(45.0)
+#: Length of a line before and beyond its corner, [cm]: more than label rows see.
+_LENGTH_CM = 90.0
+#: Which way from the lane's middle its lines are: the left one, the right one.
+_WAYS = (-1.0, 1.0)
+
+
+class Leg(NamedTuple):
+    """A straight piece of a lane.
+
+    Attributes:
+        x: Of a point in its middle, frame car, [cm].
+        y: Likewise.
+        angle: Its direction, clockwise from straight ahead, [rad].
+    """
+
+    x: float
+    y: float
+    angle: float
+
+    @property
+    def ahead(self) -> Float[np.ndarray, "2"]:
+        """Its direction."""
+        return np.array([math.sin(self.angle), math.cos(self.angle)])
+
+    def seen_from(
+        self, points_cm: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Return how far points of the road lie to the right of the middle, and how far along it."""
+        (sine, cosine), (x, y) = self.ahead, (points_cm - [self.x, self.y]).T
+        return x * cosine - y * sine, x * sine + y * cosine
+
+    def at(self, right_cm: float, along_cm: float) -> Float[np.ndarray, "2"]:
+        """Return a point of the road, frame car."""
+        sine, cosine = self.ahead
+        return np.array([self.x, self.y]) + right_cm * np.array([cosine, -sine]) + along_cm * self.ahead
+
+    def moved(self, pose: Float[np.ndarray, "3"], wheelbase_cm: float) -> Leg:
+        """Return it as the car sees it from where it has driven to, by its pose in its own former frame."""
+        before_cm = map_from_car(np.array([[self.x, self.y]]), np.zeros(3), wheelbase_cm)
+        ((x, y),) = car_from_map(before_cm, pose, wheelbase_cm).tolist()
+        return Leg(x, y, self.angle + float(pose[2]))
+
+
+class LaneCorner(NamedTuple):
+    """A lane that turns at once.
+
+    Attributes:
+        before: The lane up to the corner.
+        after: The lane from there on.
+        width_cm: Its width.
+    """
+
+    before: Leg
+    after: Leg
+    width_cm: float
+
+    @property
+    def turn(self) -> float:
+        """By how much it turns to the right, [rad]."""
+        return float(wrap_angle(np.array(self.after.angle - self.before.angle)))
+
+    def place_cm(self, way: float) -> Float[np.ndarray, "2"]:
+        """Return where a line has its corner, frame car: left -1, right 1, the middle 0."""
+        aside_cm = 0.5 * way * self.width_cm
+        (right_cm,), _ = self.after.seen_from(self.before.at(aside_cm, 0.0)[None])
+        # On the way along the lane before, the distance to the lane beyond changes by the sine of the angle.
+        return self.before.at(aside_cm, (right_cm - aside_cm) / math.sin(self.turn))
+
+    def line_cm(self, way: float) -> Float[np.ndarray, "3 2"]:
+        """Return a line, or the middle, from before the corner to beyond it, frame car."""
+        place_cm = self.place_cm(way)
+        back_cm, on_cm = -_LENGTH_CM * self.before.ahead, _LENGTH_CM * self.after.ahead
+        return np.array([place_cm + back_cm, place_cm, place_cm + on_cm])
+
+    def is_like(self, other: LaneCorner) -> bool:
+        """Return whether another finding is the same corner."""
+        apart_cm = max(math.dist(self.place_cm(way), other.place_cm(way)) for way in _WAYS)
+        return apart_cm < _SAME_CM and abs(self.turn - other.turn) < _SAME_TURN
+
+
+class CornerAhead:
+    """The corner that the car comes to, or is led around.
+
+    Attributes:
+        corner: The last one that was found, as the car sees it now.
+        on: Whether the car is led around it.
+    """
+
+    def __init__(self) -> None:
+        """Know of none."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what earlier frames showed."""
+        self.corner: LaneCorner | None = None
+        self.on = False
+        self._found = 0
+        self._driven_cm = self._unseen_cm = 0.0
+
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`."""
+        if self.corner is None:
+            return
+        half_rad = 0.5 * turn_rad
+        pose = np.array([travel_cm * math.cos(half_rad), travel_cm * math.sin(half_rad), turn_rad])
+        before, after, width_cm = self.corner
+        self.corner = LaneCorner(before.moved(pose, wheelbase_cm), after.moved(pose, wheelbase_cm), width_cm)
+        self._driven_cm += abs(travel_cm)
+        self._unseen_cm += abs(travel_cm)
+
+    def look(self, found: LaneCorner | None) -> None:
+        """Take a frame before the corner: what :func:`find_corner` found in it."""
+        if found is not None:
+            again = self.corner is not None and found.is_like(self.corner)
+            self._found = self._found + 1 if again else 1
+            self.corner, self._driven_cm, self._unseen_cm = found, 0.0, 0.0
+        if self.corner is None:
+            return
+        if self._unseen_cm > _UNSEEN_CM:
+            self.reset()
+            return
+        inner = math.copysign(1.0, self.corner.turn)
+        self.on = self._found >= _BELIEVED and float(self.corner.place_cm(inner)[1]) < _BEGINS_CM
+
+    def follow(self, markings_cm: Sequence[float], edges: RoadEdges) -> bool:
+        """Take a frame on the way around the corner.
+
+        Args:
+            markings_cm: Width of the marking of each line, negative for one that is darker than the floor.
+            edges: The frame's edge points.
+
+        Returns:
+            Whether the way goes on.
+        """
+        assert self.corner is not None
+        before_cm, after_cm = _AGAIN_CM
+        before, count = _fitted(self.corner, False, markings_cm, edges, before_cm)
+        if count >= _LEAST:
+            self.corner = self.corner._replace(before=before)
+        after, count = _fitted(self.corner, True, markings_cm, edges, after_cm)
+        if count >= _LEAST:
+            self.corner, self._unseen_cm = self.corner._replace(after=after), 0.0
+        away = abs(float(wrap_angle(np.array(self.corner.after.angle))))
+        too_long = self._unseen_cm > _UNSEEN_ON_THE_WAY_CM or self._driven_cm > _FARTHEST_CM
+        self.on = not (too_long or away > _BACK or abs(self.corner.turn) < _NONE or self._is_around(away))
+        return self.on
+
+    def _is_around(self, away_rad: float) -> bool:
+        assert self.corner is not None
+        return away_rad < _AROUND and all(self.corner.place_cm(way)[1] < 0.0 for way in _WAYS)
+
+    def lane(self) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
+        """Return the lines at the label rows and their sigmas.
+
+        NaN and infinite where a line does not cross the row, or runs along it: its place is not told by x.
+        """
+        assert self.corner is not None
+        across_cm = math.hypot(_SIGMA_CM, _GROWTH * self._unseen_cm)
+        points_cm, sigma_cm = (
+            np.full((len(SIDES), len(ROWS_CM)), np.nan),
+            np.full((len(SIDES), len(ROWS_CM)), np.inf),
+        )
+        for side, way in enumerate(_WAYS):
+            line_cm = self.corner.line_cm(way)
+            for leg, piece_cm in ((self.corner.before, line_cm[:2]), (self.corner.after, line_cm[1:])):
+                crossed_cm = rows_of_polyline(piece_cm)
+                here = np.isfinite(crossed_cm) & (abs(wrap_angle(np.array(leg.angle))) < _STEEPEST)
+                points_cm[side, here], sigma_cm[side, here] = (
+                    crossed_cm[here],
+                    across_cm / math.cos(leg.angle),
+                )
+        return points_cm, sigma_cm
+
+    def lane_beyond(self) -> Float[np.ndarray, "2 3"] | None:
+        """Return the lines beyond the corner at the label rows; None where they run along these."""
+        assert self.corner is not None
+        after = self.corner.after
+        if abs(float(wrap_angle(np.array(after.angle)))) > _STEEPEST:
+            return None
+        aside_cm = 0.5 * self.corner.width_cm / math.cos(after.angle)
+        middle_cm = after.x + (np.array(ROWS_CM) - after.y) * math.tan(after.angle)
+        return np.array([middle_cm - aside_cm, middle_cm + aside_cm])
+
+
+def find_corner(
+    lines_cm: Float[np.ndarray, "2 3"],
+    width_cm: float,
+    markings_cm: Sequence[float],
+    hints: Sequence[Corner | None],
+    edges: RoadEdges,
+) -> LaneCorner | None:
+    """Find the corner of a lane, by what is seen of both of its lines before and beyond it.
+
+    Args:
+        lines_cm: x of the lane's lines at the label rows if it goes straight on, frame car.
+        width_cm: Its width.
+        markings_cm: Width of the marking of each line, negative for one that is darker than the floor.
+        hints: The corners of these lines, see :func:`lanenet.perception.network.corner.corners`.
+        edges: The frame's edge points.
+
+    Returns:
+        The corner; None if there is none.
+    """
+    turns = [turn for hint in hints if hint is not None for turn in _tried_turns(hint)]
+    if not turns:
+        return None
+    near_cm, _, far_cm = lines_cm.mean(axis=0).tolist()
+    before = Leg(near_cm, ROWS_CM[0], math.atan2(far_cm - near_cm, ROWS_CM[-1] - ROWS_CM[0]))
+    borders = [_Borders.of(before, width_cm, marking_cm, edges) for marking_cm in markings_cm]
+    straight = [line.seen_straight(0.5 * way * width_cm) for way, line in zip(_WAYS, borders, strict=True)]
+    best, best_start_cm, best_turn = -math.inf, math.nan, math.nan
+    for turn in turns:
+        inner = SIDES.index("right") if turn > 0.0 else SIDES.index("left")
+        seen = [
+            line.seen_beyond(0.5 * way * width_cm, turn) for way, line in zip(_WAYS, borders, strict=True)
+        ]
+        of_inner, of_outer = seen[inner].sum(axis=1), seen[1 - inner].sum(axis=1)
+        at_corner = seen[1 - inner][:, : round(_AT_CORNER_CM / _PIECE_CM)].any(axis=1)
+        likely = at_corner & (of_inner >= _INNER) & (of_outer >= _OUTER) & (of_inner + of_outer >= _BOTH)
+        ahead_cm = 0.5 * width_cm * math.tan(0.5 * abs(turn))
+        for place in np.flatnonzero(likely).tolist():
+            start_cm, score = place / abs(math.sin(turn)), float(of_inner[place] + of_outer[place])
+            inner_cm, outer_cm = start_cm - ahead_cm, start_cm + ahead_cm
+            is_corner = (
+                score > best
+                and _CORNERS_CM[0] < outer_cm < _CORNERS_CM[1]
+                and (inner_cm >= _BESIDE_CM or of_inner[place] >= _INNER_BESIDE)
+                and _count(straight[1 - inner], outer_cm - _AT_CORNER_CM, outer_cm) > 0
+                and all(
+                    _count(straight[side], corner_cm + _BEYOND_CM[0], corner_cm + _BEYOND_CM[1]) <= _GOES_ON
+                    for side, corner_cm in ((inner, inner_cm), (1 - inner, outer_cm))
+                )
+            )
+            if is_corner:
+                best, best_start_cm, best_turn = score, start_cm, turn
+    if math.isnan(best_turn):
+        return None
+    x, y = before.at(0.0, best_start_cm).tolist()
+    found = LaneCorner(before, Leg(x, y, before.angle + best_turn), width_cm)
+    for gate_cm in _FIRST_CM:
+        after, count = _fitted(found, True, markings_cm, edges, gate_cm)
+        if count < _LEAST:
+            return None
+        found = found._replace(after=after)
+        if abs(found.turn) < _LEAST_TURN:
+            return None
+    return found
+
+
+def _tried_turns(hint: Corner) -> list[float]:
+    """Return the angles of a lane's corner that one of its lines speaks for."""
+    turn = math.copysign(math.acos(min(1.0, max(-1.0, hint.cosine))), hint.aside_cm)
+    return [turn + more for more in _TRIED_TURNS.tolist() if abs(turn + more) > _LEAST_TURN]
+
+
+class _Borders(NamedTuple):
+    """Edge points moved to the middle of a marking, as a leg of the lane sees them, and their normals."""
+
+    right_cm: Float[np.ndarray, "n"]
+    along_cm: Float[np.ndarray, "n"]
+    normal_right: Float[np.ndarray, "n"]
+    normal_along: Float[np.ndarray, "n"]
+
+    @classmethod
+    def of(cls, leg: Leg, width_cm: float, marking_cm: float, edges: RoadEdges) -> _Borders:
+        """Take those about the leg."""
+        normals = edges.normals.astype(np.float64)
+        right_cm, along_cm = leg.seen_from(edges.points_cm + 0.5 * marking_cm * normals)
+        near = (along_cm > _NEAR_CM) & (along_cm < _FAR_CM) & (np.abs(right_cm) < _BESIDE * width_cm)
+        direction = Leg(0.0, 0.0, leg.angle)
+        return cls(right_cm[near], along_cm[near], *direction.seen_from(normals[near]))
+
+    def seen_straight(self, aside_cm: float) -> Bool[np.ndarray, "b"]:
+        """Return in which pieces along the leg a line is seen that many cm to the right of the middle."""
+        limit_cm = _NEAR_LINE_CM + _NEAR_LINE_GROWTH * np.abs(self.along_cm)
+        own = (np.abs(self.right_cm - aside_cm) < limit_cm) & (np.abs(self.normal_right) > _COSINE)
+        seen = np.zeros(int((_FAR_CM - _NEAR_CM) / _PIECE_CM) + 1, np.bool_)
+        seen[((self.along_cm[own] - _NEAR_CM) / _PIECE_CM).astype(np.int64)] = True
+        return seen
+
+    def seen_beyond(self, aside_cm: float, turn: float) -> Float[np.ndarray, "p b"]:
+        """Return how a line is seen in the pieces beyond each of the corners that it may have."""
+        sine, cosine = math.sin(turn), math.cos(turn)
+        # Where the line through each point that has turned leaves the straight one, along this.
+        beyond_cm = aside_cm - (self.right_cm * cosine - self.along_cm * sine)
+        leaves_cm = beyond_cm / sine - aside_cm * math.tan(0.5 * turn)
+        further_cm = (self.right_cm - aside_cm) * sine + (self.along_cm - leaves_cm) * cosine
+        facing = self.normal_right * cosine - self.normal_along * sine
+        place, piece = np.abs(beyond_cm).astype(np.int64), np.floor(further_cm / _PIECE_CM).astype(np.int64)
+        counts = (np.abs(facing) > _COSINE) & (beyond_cm * sine > 0.0) & (place < _PLACES)
+        counts &= (piece >= 0) & (piece < _PIECES)
+        borders = np.zeros((2, _PLACES, _PIECES), np.bool_)
+        borders[(facing > 0.0).astype(np.int64)[counts], place[counts], piece[counts]] = True
+        borders[:, 1:] |= borders[:, :-1].copy()
+        one, both = borders.any(axis=0), borders.all(axis=0)
+        return np.where(both, 1.0, np.where(one, _ONE_BORDER, 0.0))
+
+
+def _count(seen: Bool[np.ndarray, "b"], from_cm: float, to_cm: float) -> int:
+    """Return in how many pieces a line is seen between two places along the leg."""
+    first, end = (max(round((at_cm - _NEAR_CM) / _PIECE_CM), 0) for at_cm in (from_cm, to_cm))
+    return int(np.count_nonzero(seen[first:end]))
+
+
+def _fitted(
+    corner: LaneCorner, is_after: bool, markings_cm: Sequence[float], edges: RoadEdges, gate_cm: float
+) -> tuple[Leg, int]:
+    """Fit one leg of a corner to the borders of both lines; also how many borders count."""
+    leg = corner.after if is_after else corner.before
+    x, y = corner.place_cm(0.0).tolist()
+    leg = leg._replace(x=x, y=y)
+    normals = edges.normals.astype(np.float64)
+    facing, _ = Leg(0.0, 0.0, leg.angle).seen_from(normals)
+    along_cm, off_cm = [], []
+    for way, marking_cm in zip(_WAYS, markings_cm, strict=True):
+        right_cm, far_cm = leg.seen_from(edges.points_cm + 0.5 * marking_cm * normals)
+        _, (start_cm,) = leg.seen_from(corner.place_cm(way)[None])
+        further_cm = far_cm - start_cm if is_after else start_cm - far_cm
+        beside_cm = right_cm - 0.5 * way * corner.width_cm
+        own = (np.abs(beside_cm) < gate_cm) & (np.abs(facing) > _FIT_COSINE)
+        own &= (further_cm > _CLEAR_CM) & (further_cm < _REACH_CM)
+        along_cm.append(far_cm[own])
+        off_cm.append(beside_cm[own])
+    along, off = np.concatenate(along_cm), np.concatenate(off_cm)
+    if len(off) < _LEAST:
+        return leg, len(off)
+    weight = 1.0 / (1.0 + (off / _CAUCHY_CM) ** 2)
+    shape = np.column_stack([np.ones_like(along), along])
+    normal = (shape * weight[:, None]).T @ shape + np.diag([_STIFF, _STIFF_TURN])
+    shift_cm, slope = np.linalg.solve(normal, (shape * weight[:, None]).T @ off).tolist()
+    x, y = leg.at(shift_cm, 0.0).tolist()
+    turned = min(max(math.atan(slope), -_TURN_AT_ONCE), _TURN_AT_ONCE)
+    return Leg(x, y, leg.angle + turned), len(off)
