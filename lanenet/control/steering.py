@@ -92,14 +92,15 @@ def corner_target_rad(
         side, and begins R tan(t / 2) before it.
     """
     first_cm, corner_cm, last_cm = np.asarray(centre_line_cm, np.float64)
-    there, on = ((b - a) / math.dist(a, b) for a, b in ((first_cm, corner_cm), (corner_cm, last_cm)))
+    legs_cm = math.dist(first_cm, corner_cm), math.dist(corner_cm, last_cm)
+    there, on = (corner_cm - first_cm) / legs_cm[0], (last_cm - corner_cm) / legs_cm[1]
     half_rad = 0.5 * math.acos(min(1.0, max(-1.0, float(there @ on))))
     aside = 1.0 / math.cos(half_rad) - 1.0
     radius_cm = settings.wheelbase_cm / math.sin(settings.max_steering_rad)
     width_cm = settings.lane_width_cm if lane_width_cm is None else lane_width_cm
     if width_cm is not None and radius_cm * aside > _MOST_ASIDE * width_cm:
         radius_cm = _MOST_ASIDE * width_cm / aside
-    cut_cm = radius_cm * math.tan(half_rad)
+    cut_cm = min(radius_cm * math.tan(half_rad), *legs_cm)
     # A parabola with the tangents of the arc.
     t = _SHARES[:, None]
     arc_cm = corner_cm + cut_cm * (t * t * on - (1.0 - t) ** 2 * there)

@@ -192,7 +192,7 @@ def test_sigma_grows_while_nothing_of_it_is_seen_and_on_a_line_that_runs_aside()
     points_cm, sigma_cm = corner.lane()
     aside = np.isfinite(points_cm)
     assert aside.any() and sigma_cm[aside] == pytest.approx(
-        math.hypot(1.0, 0.8) / math.cos(math.radians(70.0) - 0.6), rel=0.2
+        math.hypot(0.7, 0.8) / math.cos(math.radians(70.0) - 0.6), rel=0.2
     )
 
 

@@ -58,8 +58,11 @@ _SAME_CM, _SAME_TURN, _BELIEVED, _BEGINS_CM = 6.0, 0.2, 2, 36.0
 #: in all; where the lane would lead back; and where it has become no corner. Chosen.
 _AROUND, _BACK, _NONE = 0.45, 2.2, 0.5 * _LEAST_TURN
 _UNSEEN_CM, _UNSEEN_ON_THE_WAY_CM, _FARTHEST_CM = 45.0, 60.0, 200.0
-#: Sigma of a line, across it, [cm], and its growth per cm in which nothing of it was seen.
-_SIGMA_CM, _GROWTH = 1.0, 0.04
+#: Sigma of a line, across it, [cm], before the share that a tracker claims, and its growth per cm in which
+#: nothing of it was seen. On 28 simulated roads, on which the corners' rules were chosen, 90, 90 and 85 % of
+#: 9787 points at 0, 15 and 30 cm lay within one sigma, and 99, 98 and 96 % within two: real cameras are known
+#: less closely.
+_SIGMA_CM, _GROWTH = 0.7, 0.04
 #: Points on a line that runs at more than this angle across the car's direction are not answered, [rad].
 _STEEPEST = math.radians(45.0)
 #: Length of a line before and beyond its corner, [cm]: more than label rows see.

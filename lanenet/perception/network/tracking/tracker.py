@@ -150,6 +150,8 @@ class LaneTracker:
         self._which_lane = WhichLane()
         self.straight_on = StraightOn()
         self.corner = CornerAhead()
+        #: Whether the last frame showed both lines beyond the label rows.
+        self._goes_on = False
         self._view = view
         self._markings = MarkingWidths()
         self._width_here = WidthHere()
@@ -160,6 +162,7 @@ class LaneTracker:
         self._which_lane.reset()
         self.straight_on.reset()
         self.corner.reset()
+        self._goes_on = False
         self.looks.reset()
         self._width_here.reset()
         self._markings.reset()
@@ -291,9 +294,10 @@ class LaneTracker:
         """
         seen = [side for side, line in enumerate(pair) if line.seen_cm >= _LINE_SEEN_CM]
         plain = [side for side in seen if presence[side] >= SEEN]
-        if len(plain) == len(pair) and all(
+        self._goes_on = len(plain) == len(pair) and all(
             line.seen_to_cm >= _GOES_ON_CM and line.seen_cm >= _GOES_ON_SEEN_CM for line in pair
-        ):
+        )
+        if self._goes_on:
             return
         lines = [pair[side] for side in seen]
         found = corners([line.points_cm for line in lines], [line.marking_cm for line in lines], borders)
@@ -426,7 +430,7 @@ class LaneTracker:
                 self._leave_corner()
             return goes_on
         lines_cm, found = self.straight_on.expected_cm, None
-        if lines_cm is not None and not self.straight_on.on:
+        if lines_cm is not None and not self.straight_on.on and not self._goes_on:
             hints = corners(lines_cm.tolist(), markings_cm, borders)
             found = find_corner(lines_cm, width_cm, markings_cm, hints, borders.edges)
         self.corner.look(found)
@@ -438,6 +442,7 @@ class LaneTracker:
         """Answer with the lane that turns at once."""
         self.straight_on.forget_lane()
         self._last = self._rival = None
+        self._goes_on = False
         self._width_here.look(None)
         points_cm, sigma_cm = self.corner.lane()
         doubt_cm = np.hypot(sigma_cm, _LABEL_CM)
