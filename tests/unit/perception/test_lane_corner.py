@@ -205,6 +205,11 @@ def test_it_is_given_up_when_nothing_of_it_is_seen():
     assert not corner.follow(MARKINGS_CM, nothing) and not corner.on
 
 
+def test_it_is_given_up_by_a_caller_that_stops_telling_the_cars_motion():
+    corner, nothing = on_the_way(), RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
+    assert [corner.follow(MARKINGS_CM, nothing) for _ in range(41)] == [True] * 40 + [False]
+
+
 def test_it_ends_beyond_the_corner():
     corner = on_the_way()
     corner.moved(0.0, 0.0, WHEELBASE_CM)
