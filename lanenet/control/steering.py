@@ -89,7 +89,8 @@ def corner_target_rad(
 
     Source:
         Own derivation: an arc of radius R passes a corner of angle t at R (1 / cos(t / 2) - 1) on its inner
-        side, and begins R tan(t / 2) before it.
+        side, and begins R tan(t / 2) before it. What is driven is a parabola with its tangents, which turns
+        more in the middle and cuts less.
     """
     first_cm, corner_cm, last_cm = np.asarray(centre_line_cm, np.float64)
     legs_cm = math.dist(first_cm, corner_cm), math.dist(corner_cm, last_cm)

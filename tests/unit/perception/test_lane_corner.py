@@ -76,14 +76,28 @@ def side_road(centre: bool) -> RoadEdges:
     return edges_of([right, *left, *dashes])
 
 
-def bend() -> RoadEdges:
-    """Both lines of a lane that bends to the right, 60 cm about the middle."""
-    angle = np.linspace(0.0, 1.4, 60)
-    arcs = [np.stack([60.0 - r * np.cos(angle), 20.0 + r * np.sin(angle)], axis=1) for r in (80.0, 40.0)]
-    return edges_of([np.vstack([[arc[0, 0], 0.0], arc]) for arc in arcs])
+def bend(radius_cm: float, begins_cm: float, width_cm: float = WIDTH_CM) -> RoadEdges:
+    """Both lines of a lane that bends to the right by 90 degrees, that far about the middle."""
+    angle, lines = np.linspace(0.0, 0.5 * np.pi, 60), []
+    for r in (radius_cm + 0.5 * width_cm, radius_cm - 0.5 * width_cm):
+        arc = np.stack([radius_cm - r * np.cos(angle), begins_cm + r * np.sin(angle)], axis=1)
+        lines.append(np.vstack([[arc[0, 0], 0.0], arc, arc[-1] + [100.0, 0.0]]))
+    return edges_of(lines)
 
 
 STOP_LINE = np.array([[-20.0, 30.0], [20.0, 30.0]])
+
+
+def crossing_road() -> list[np.ndarray]:
+    return [np.array([[-64.0, y], [64.0, y]]) for y in (22.0, 62.0)]
+
+
+def dashes() -> list[np.ndarray]:
+    """Both lines of a lane straight ahead, beyond 22 cm in dashes of 10 cm."""
+    pieces = [(0.0, 22.0), *((y, y + 10.0) for y in np.arange(32.0, 95.0, 20.0))]
+    return [np.array([[x, a], [x, b]]) for x in (-20.0, 20.0) for a, b in pieces]
+
+
 TO_STOP_LINE = [np.array([[x, 0.0], [x, 30.0]]) for x in (-20.0, 20.0)]
 
 
@@ -98,13 +112,23 @@ TO_STOP_LINE = [np.array([[x, 0.0], [x, 30.0]]) for x in (-20.0, 20.0)]
         pytest.param(side_road(centre=True), id="a side road with a centre line"),
         pytest.param(edges_of([*lines_of(0.0, 40.0), STOP_LINE]), id="a stop line"),
         pytest.param(edges_of([*TO_STOP_LINE, STOP_LINE]), id="a stop line at the end"),
-        pytest.param(bend(), id="a bend"),
+        pytest.param(edges_of([*crossing_road(), *dashes()]), id="a crossing road, and dashes that go on"),
         pytest.param(edges_of(lines_of(30.0, 40.0)), id="a kink"),
         pytest.param(RoadEdges(np.empty((0, 2)), np.empty((0, 2))), id="nothing"),
     ],
 )
 def test_what_is_no_corner_of_the_lane_is_not_found(edges):
     assert found_in(edges) is None
+
+
+@pytest.mark.parametrize("width_cm", [25.0, 30.0, 40.0])
+@pytest.mark.parametrize("inner_cm", [10.0, 15.0, 20.0, 25.0, 35.0])
+def test_a_bend_is_no_corner(inner_cm, width_cm):
+    lines_cm = LANE * width_cm / WIDTH_CM
+    for begins_cm in np.arange(2.0, 66.0, 8.0):
+        edges = bend(inner_cm + 0.5 * width_cm, begins_cm, width_cm)
+        hints = corners(lines_cm.tolist(), MARKINGS_CM, RoadBorders(edges))
+        assert find_corner(lines_cm, width_cm, MARKINGS_CM, hints, edges) is None
 
 
 @pytest.mark.parametrize("width_cm", [30.0, 52.0])
@@ -126,18 +150,32 @@ def test_its_lines_meet_where_both_legs_do():
 
 def test_a_corner_is_believed_once_it_was_found_twice_in_the_same_place():
     corner = CornerAhead()
-    corner.look(ahead(40.0))
+    for found_cm, is_believed in ((60.0, False), (48.0, False), (47.0, True)):
+        # It lies 2 cm nearer now.
+        corner.moved(2.0, 0.0, WHEELBASE_CM)
+        corner.look(ahead(found_cm))
+        assert corner.on == is_believed
+
+
+def test_a_car_that_stands_believes_no_corner():
+    corner = CornerAhead()
+    for _ in range(5):
+        corner.moved(0.0, 0.0, WHEELBASE_CM)
+        corner.look(ahead(40.0))
     assert not corner.on
-    corner.look(ahead(50.0))
-    assert not corner.on
-    corner.look(ahead(48.0))
-    assert corner.on
+
+
+def test_a_corner_is_forgotten_where_nobody_knows_how_the_car_moved():
+    corner = on_the_way()
+    corner.moved(math.nan, 0.0, WHEELBASE_CM)
+    assert corner.corner is None and not corner.on
 
 
 def test_the_way_around_begins_near_the_inner_lines_corner():
     corner = CornerAhead()
-    for _ in range(3):
-        corner.look(ahead(60.0))
+    for y_cm in (64.0, 62.0, 60.0):
+        corner.moved(2.0, 0.0, WHEELBASE_CM)
+        corner.look(ahead(y_cm))
     assert not corner.on
     corner.moved(12.0, 0.0, WHEELBASE_CM)
     corner.look(None)
@@ -168,8 +206,9 @@ def test_the_corner_moves_with_the_car(travel_cm, turn_rad):
 
 def on_the_way(corner_cm: float = 40.0) -> CornerAhead:
     corner = CornerAhead()
-    for _ in range(2):
-        corner.look(ahead(corner_cm))
+    for before_cm in (2.0, 0.0):
+        corner.moved(2.0, 0.0, WHEELBASE_CM)
+        corner.look(ahead(corner_cm + before_cm))
     assert corner.on
     return corner
 
@@ -202,7 +241,7 @@ def test_it_is_given_up_when_nothing_of_it_is_seen():
         corner.moved(5.0, 0.0, WHEELBASE_CM)
         assert corner.follow(MARKINGS_CM, nothing)
     corner.moved(5.0, 0.0, WHEELBASE_CM)
-    assert not corner.follow(MARKINGS_CM, nothing) and not corner.on
+    assert not corner.follow(MARKINGS_CM, nothing) and not corner.on and not corner.is_behind
 
 
 def test_it_is_given_up_by_a_caller_that_stops_telling_the_cars_motion():
@@ -215,7 +254,7 @@ def test_it_ends_beyond_the_corner():
     corner.moved(0.0, 0.0, WHEELBASE_CM)
     corner.corner = LaneCorner(Leg(0.0, -40.0, -1.0), Leg(0.0, -30.0, 0.1), WIDTH_CM)
     edges = edges_of([np.array([[x - 2.0, 0.0], [x + 8.0, 95.0]]) for x in (-20.0, 20.0)])
-    assert not corner.follow(MARKINGS_CM, edges)
+    assert not corner.follow(MARKINGS_CM, edges) and corner.is_behind
     beyond_cm = corner.lane_beyond()
     assert beyond_cm is not None and beyond_cm[1] - beyond_cm[0] == pytest.approx(np.full(3, 40.0), abs=0.5)
 
@@ -281,6 +320,29 @@ def test_without_the_cars_motion_no_corner_is_followed():
     for _ in range(30):
         drive.step()
         assert drive.tracker.corner.corner is None
+
+
+def test_a_corner_that_was_given_up_leaves_no_lane():
+    drive, nothing = Drive(70.0), RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
+    while not drive.tracker.corner.on:
+        drive.step()
+    for _ in range(40):
+        drive.tracker.moved(3.0, 0.0, WHEELBASE_CM)
+        found_cm, _, _ = drive.tracker.follow(LANE.reshape(6), np.full(6, 5.0), np.zeros(2), nothing)
+    assert not drive.tracker.corner.on and drive.tracker.straight_on.expected_cm is None
+    assert np.isnan(found_cm).all()
+
+
+def test_around_a_corner_the_motion_that_is_told_may_be_wrong():
+    drive = Drive(70.0)
+    told = drive.tracker.moved
+    drive.tracker.moved = lambda travel, turn, wheelbase: told(1.05 * travel, 1.05 * turn, wheelbase)  # type: ignore[method-assign]
+    worst_cm = 0.0
+    for _ in range(65):
+        off_cm = drive.step()
+        if drive.tracker.corner.on:
+            worst_cm = max([worst_cm, *np.abs(off_cm[np.isfinite(off_cm)])])
+    assert 0.0 < worst_cm < 3.0 and abs(drive.beside_cm()) < 4.0
 
 
 def test_a_reset_forgets_the_corner():

@@ -23,6 +23,7 @@ from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.network.model_file import HASH_NAME, ModelMeta, read_model_meta, sealed
+from lanenet.perception.network.tracking.lane_corner import LaneCorner, Leg
 from lanenet.perception.network.tracking.tracker import LaneTracker
 from lanenet.perception.registry import build_detector
 
@@ -99,6 +100,27 @@ def test_a_frame_gives_points_errors_and_steering(model_path):
     centre = (estimate.points_cm[1] + estimate.points_cm[4]) / 2.0
     assert estimate.steering_rad == pytest.approx(math.atan2(-centre, 15.0), abs=1e-5)
     assert 0.0 < estimate.confidence <= 1.0
+
+
+def test_around_a_corner_the_answer_has_the_lanes_centre(model_path, monkeypatch):
+    detector = NetworkDetector(model_path, CAMERA)
+    assert detector.detect(striped_frame()).centre_line_cm is None
+    tracker = detector._tracker
+    # 70 degrees to the right, at 10 cm: no line crosses the row 15 cm ahead at less than 45 degrees.
+    tracker.corner.corner = LaneCorner(Leg(0.0, 0.0, 0.0), Leg(0.0, 0.0, math.radians(70.0)), 40.0)
+    tracker.corner.on = True
+    monkeypatch.setattr(tracker, "_at_corner", lambda borders: True)
+    estimate = detector.detect(striped_frame())
+    assert estimate.centre_line_cm is not None and estimate.centre_line_cm[1] == pytest.approx([0.0, 0.0])
+    assert estimate.centre_line_cm[2] == pytest.approx(
+        90.0 * np.array([math.sin(math.radians(70.0)), math.cos(math.radians(70.0))])
+    )
+    assert estimate.points_cm[:2] == pytest.approx([-20.0, np.nan], nan_ok=True)
+    assert 0.5 < estimate.confidence < 0.7 and (estimate.presence > 0.5).all()
+    # The centre crosses the row 15 cm ahead at 15 tan(70 deg).
+    assert estimate.steering_rad == pytest.approx(-math.radians(70.0))
+    detector.reset()
+    assert not tracker.corner.on
 
 
 def test_a_mask_hides_the_car(model_path):

@@ -150,7 +150,7 @@ class LaneTracker:
         self._which_lane = WhichLane()
         self.straight_on = StraightOn()
         self.corner = CornerAhead()
-        #: Whether the last frame showed both lines beyond the label rows.
+        #: Whether the last frame in which its lines were followed showed both beyond the label rows.
         self._goes_on = False
         self._view = view
         self._markings = MarkingWidths()
@@ -255,6 +255,7 @@ class LaneTracker:
 
     def lose(self) -> None:
         """Take a frame that shows nothing of the lane."""
+        self._goes_on = False
         self._which_lane.keep(False)
 
     def _tell_other(
@@ -452,8 +453,8 @@ class LaneTracker:
         return answer[0].ravel(), answer[1].ravel(), np.zeros(len(SIDES))
 
     def _leave_corner(self) -> None:
-        """Look for the lane beyond a corner where that was seen last."""
-        lines_cm = self.corner.lane_beyond()
+        """Look for the lane beyond a corner where it is expected, unless the corner was given up."""
+        lines_cm = self.corner.lane_beyond() if self.corner.is_behind else None
         if lines_cm is not None:
             self._last = lines_cm.tolist(), [list(_MOVED_CM)] * len(SIDES)
             self.straight_on.start_again(lines_cm)
