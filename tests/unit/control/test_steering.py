@@ -142,3 +142,8 @@ def test_a_car_far_beside_a_corner_steers_back_within_the_lock() -> None:
     # Beyond the corner, and of none at all, too.
     assert corner_target_rad(corner(-60.0, 80.0), settings()) == pytest.approx(-0.45)
     assert corner_target_rad(corner(30.0, 0.0), settings()) == 0.0
+
+
+def test_a_car_with_hardly_any_lock_rounds_no_more_than_it_is_told_of() -> None:
+    angle = corner_target_rad(corner(60.0, 90.0), settings(max_steering_rad=0.05))
+    assert -0.05 <= angle <= 0.0

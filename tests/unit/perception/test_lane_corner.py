@@ -88,6 +88,23 @@ def bend(radius_cm: float, begins_cm: float, width_cm: float = WIDTH_CM) -> Road
 STOP_LINE = np.array([[-20.0, 30.0], [20.0, 30.0]])
 
 
+def shown(
+    lines_cm: np.ndarray, inner_cm: float = 60.0, outer_cm: float = 60.0, gap_cm: float = 0.0
+) -> list[np.ndarray]:
+    """So much of the lines beyond a corner to the right, and a gap before and after that of the outer one."""
+    pieces = []
+    sides = zip(lines_cm, (outer_cm, inner_cm), (gap_cm, 0.0), strict=True)
+    for (begin, place, end), length_cm, free_cm in sides:
+        on = (end - place) / math.dist(end, place)
+        pieces.append(np.array([begin, place - [0.0, free_cm]]))
+        pieces.append(np.array([place + free_cm * on, place + (free_cm + length_cm) * on]))
+    return pieces
+
+
+def straight(x_cm: float, begin_cm: float, end_cm: float) -> np.ndarray:
+    return np.array([[x_cm, begin_cm], [x_cm, end_cm]])
+
+
 def crossing_road() -> list[np.ndarray]:
     return [np.array([[-64.0, y], [64.0, y]]) for y in (22.0, 62.0)]
 
@@ -114,6 +131,14 @@ TO_STOP_LINE = [np.array([[x, 0.0], [x, 30.0]]) for x in (-20.0, 20.0)]
         pytest.param(edges_of([*TO_STOP_LINE, STOP_LINE]), id="a stop line at the end"),
         pytest.param(edges_of([*crossing_road(), *dashes()]), id="a crossing road, and dashes that go on"),
         pytest.param(edges_of(lines_of(30.0, 40.0)), id="a kink"),
+        pytest.param(edges_of(shown(lines_of(70.0, 40.0), inner_cm=6.0)), id="hardly an inner line"),
+        pytest.param(edges_of(shown(lines_of(70.0, 40.0), outer_cm=6.0)), id="hardly an outer line"),
+        pytest.param(edges_of(shown(lines_of(70.0, 40.0), gap_cm=12.0)), id="no outer line at its corner"),
+        pytest.param(edges_of([lines_of(70.0, 25.0)[0]]), id="the outer line alone, near"),
+        pytest.param(edges_of(shown(lines_of(70.0, 40.0), inner_cm=8.0, outer_cm=10.0)), id="short pieces"),
+        pytest.param(edges_of([*lines_of(70.0, 40.0), straight(-20.0, 54.0, 75.0)]), id="a fork"),
+        pytest.param(edges_of([*lines_of(70.0, 40.0), straight(20.0, 50.0, 88.0)]), id="goes on later"),
+        pytest.param(edges_of(lines_of(90.0, 61.5)), id="far away"),
         pytest.param(RoadEdges(np.empty((0, 2)), np.empty((0, 2))), id="nothing"),
     ],
 )
@@ -259,6 +284,13 @@ def test_it_ends_beyond_the_corner():
     assert beyond_cm is not None and beyond_cm[1] - beyond_cm[0] == pytest.approx(np.full(3, 40.0), abs=0.5)
 
 
+@pytest.mark.parametrize("after", [Leg(0.0, 20.0, 2.3), Leg(0.0, 20.0, 0.2)])
+def test_a_lane_that_leads_back_or_no_longer_turns_is_given_up(after):
+    corner, nothing = on_the_way(), RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
+    corner.corner = LaneCorner(Leg(0.0, 0.0, 0.0), after, WIDTH_CM)
+    assert not corner.follow(MARKINGS_CM, nothing) and not corner.is_behind
+
+
 class Drive:
     """A car that is led around a corner by what the tracker answers; the network goes straight on."""
 
@@ -311,6 +343,7 @@ def test_a_car_is_led_around_a_corner(turn_deg):
             was_on += 1
             worst_cm = max([worst_cm, *np.abs(off_cm[np.isfinite(off_cm)])])
     assert was_on > 10 and not drive.tracker.corner.on
+    assert drive.tracker.straight_on.expected_cm is not None
     assert worst_cm < 2.0 and abs(drive.beside_cm()) < 4.0
     assert np.abs(drive.step()).max() < 1.0
 
@@ -336,7 +369,7 @@ def test_a_corner_that_was_given_up_leaves_no_lane():
 def test_around_a_corner_the_motion_that_is_told_may_be_wrong():
     drive = Drive(70.0)
     told = drive.tracker.moved
-    drive.tracker.moved = lambda travel, turn, wheelbase: told(1.05 * travel, 1.05 * turn, wheelbase)  # type: ignore[method-assign]
+    drive.tracker.moved = lambda travel, turn, wheelbase: told(1.1 * travel, 1.1 * turn, wheelbase)  # type: ignore[method-assign]
     worst_cm = 0.0
     for _ in range(65):
         off_cm = drive.step()
