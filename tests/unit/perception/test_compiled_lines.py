@@ -82,7 +82,11 @@ def test_answers_of_a_drive_are_the_same(real):
 
     def answers():
         detector = NetworkDetector(GENERAL, camera, any_camera=True, keep="right")
-        return [np.hstack(astuple(detector.detect(frame))) for frame in frames]
+        # Nobody tells how the car moves, so that there is no corner to follow.
+        return [
+            np.hstack([value for value in astuple(detector.detect(frame)) if value is not None])
+            for frame in frames
+        ]
 
     found = answers()
     assert np.isfinite(np.stack(found)[:, :6]).any(axis=1).all()
