@@ -190,6 +190,16 @@ def test_a_car_that_stands_believes_no_corner():
     assert not corner.on
 
 
+def test_a_slow_car_believes_a_corner_as_well():
+    corner, believed = CornerAhead(), []
+    for frame in range(4):
+        corner.moved(0.4, 0.0, WHEELBASE_CM)
+        corner.look(ahead(40.0 - 0.4 * frame))
+        believed.append(corner.on)
+    # It has driven 1.2 cm since it found the corner first.
+    assert believed == [False, False, False, True]
+
+
 def test_a_corner_is_forgotten_where_nobody_knows_how_the_car_moved():
     corner = on_the_way()
     corner.moved(math.nan, 0.0, WHEELBASE_CM)

@@ -421,8 +421,9 @@ class LaneTracker:
 
         That needs the car's motion, and how wide the markings are.
         """
-        width_cm, markings_cm = self.lane.width_cm, self._known_markings_cm()
-        if width_cm is None or markings_cm is None or not self.straight_on.told:
+        width_cm = self.lane.width_cm
+        markings_cm = self._known_markings_cm() if self.straight_on.told else None
+        if width_cm is None or markings_cm is None:
             self.corner.reset()
             return False
         if self.corner.on:
