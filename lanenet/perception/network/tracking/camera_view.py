@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM, parabola_through
@@ -29,6 +29,10 @@ class CameraView:
         shown = camera.shows_ground(ground.reshape(-1, 2)).reshape(ground.shape[:2])
         first_cm = np.where(shown.any(axis=1), ahead[shown.argmax(axis=1)], _AHEAD_CM)
         self._hidden_cm = [np.maximum(first_cm - row, 0.0).tolist() for row in ROWS_CM]
+
+    def shows(self, points_cm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """Return which points of the road, frame car, are in the image."""
+        return self._camera.shows_ground(points_cm)
 
     def shows_line(self, line_cm: Float[np.ndarray, "3"]) -> bool:
         """Return whether most of a line, given by its points at the label rows, is in the image."""

@@ -15,35 +15,28 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lanenet.geometry.frames import car_from_map, map_from_car, wrap_angle
+from lanenet.geometry.frames import wrap_angle
 from lanenet.geometry.lane import ROWS_CM, SIDES, rows_of_polyline
 from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.network.corner import Corner
+from lanenet.perception.network.tracking.leg import PIECE_CM, Leg, LegBorders, pieces_seen
 
 #: Least angle of a corner, [rad]: the rest are bends, which the lines at the label rows show. On 160 roads of
 #: one seed all of the eleven findings that were more than 4 cm off had been below 37 degrees.
 _LEAST_TURN = math.radians(38.0)
 #: By how much a corner of the lane may turn by more or less than that of a line, [rad]. Chosen.
 _TRIED_TURNS = np.radians([-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0])
-#: What is looked at of the lane before the corner: y along it, [cm], and how far beside it, in widths.
-_NEAR_CM, _FAR_CM, _BESIDE = -15.0, 100.0, 2.0
-#: Length of a piece in which a line is seen or not, [cm]; pieces beyond the corner; and how many places of it
-#: are tried, 1 cm apart across the lane beyond.
-_PIECE_CM, _PIECES, _PLACES = 3.0, 12, 90
-#: A piece counts whole in which both borders of the marking are seen, and this much with one of them. So much
-#: has to be seen beyond the corner of the inner and of the outer line, and of both; of the inner one more
-#: where the corner is beside the car, since stop lines lead to such places. Tried for one border, with turns
-#: in all directions: with 0.3, 0.4 and 0.5 34, 37 and 39 of 52 corners were found on eight roads.
-_ONE_BORDER, _INNER, _OUTER, _BOTH, _INNER_BESIDE, _BESIDE_CM = 0.5, 2.0, 3.0, 8.0, 4.0, 8.0
+#: In so many pieces has the inner and the outer line to be seen beyond the corner, and both; the inner one in
+#: more where the corner is beside the car, since stop lines lead to such places. Chosen.
+_INNER, _OUTER, _BOTH, _INNER_BESIDE, _BESIDE_CM = 2.0, 3.0, 8.0, 4.0, 8.0
 #: The outer line is seen within so much before and after its corner, [cm]. It is none where one of them goes
 #: straight on beyond, over more than so many pieces between these distances, or both together do, further on.
 #: Chosen: with at most four of each up to 60 cm a fifth less corners are found.
 _AT_CORNER_CM, _BEYOND_CM, _GOES_ON, _FURTHER_CM, _GO_ON = 9.0, (4.0, 22.0), 3, (4.0, 60.0), 8
 #: Where the outer line's corner may be, ahead of the front axle. Chosen.
 _CORNERS_CM = (8.0, 80.0)
-#: A border belongs to a straight line within this distance, at y = 0 and its growth per cm ahead, and from
-#: these cosines on: when looked for and when fitted.
-_NEAR_LINE_CM, _NEAR_LINE_GROWTH, _COSINE, _FIT_COSINE = 2.0, 0.03, 0.9, 0.85
+#: From this cosine on a border belongs to a line that is fitted.
+_FIT_COSINE = 0.85
 #: Distances, [cm], up to which borders count when a corner is fitted for the first time, and later those of
 #: the lane before and beyond it; distance that takes half of a border's weight; between which distances from
 #: the corner they count; and the least number of them. Chosen.
@@ -76,48 +69,6 @@ _STEEPEST = math.radians(45.0)
 _LENGTH_CM = 90.0
 #: Which way from the lane's middle its lines are: the left one, the right one.
 _WAYS = (-1.0, 1.0)
-
-
-class Leg(NamedTuple):
-    """A straight piece of a lane.
-
-    Attributes:
-        x: Of a point in its middle, frame car, [cm].
-        y: Likewise.
-        angle: Its direction, clockwise from straight ahead, [rad].
-    """
-
-    x: float
-    y: float
-    angle: float
-
-    @property
-    def away_rad(self) -> float:
-        """By how much it leads away from straight ahead, to either side."""
-        return abs(float(wrap_angle(np.array(self.angle))))
-
-    @property
-    def ahead(self) -> Float[np.ndarray, "2"]:
-        """Its direction."""
-        return np.array([math.sin(self.angle), math.cos(self.angle)])
-
-    def seen_from(
-        self, points_cm: Float[np.ndarray, "n 2"]
-    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Return how far points of the road lie to the right of the middle, and how far along it."""
-        (sine, cosine), (x, y) = self.ahead, (points_cm - [self.x, self.y]).T
-        return x * cosine - y * sine, x * sine + y * cosine
-
-    def at(self, right_cm: float, along_cm: float) -> Float[np.ndarray, "2"]:
-        """Return a point of the road, frame car."""
-        sine, cosine = self.ahead
-        return np.array([self.x, self.y]) + right_cm * np.array([cosine, -sine]) + along_cm * self.ahead
-
-    def moved(self, pose: Float[np.ndarray, "3"], wheelbase_cm: float) -> Leg:
-        """Return it as the car sees it from where it has driven to, by its pose in its own former frame."""
-        before_cm = map_from_car(np.array([[self.x, self.y]]), np.zeros(3), wheelbase_cm)
-        ((x, y),) = car_from_map(before_cm, pose, wheelbase_cm).tolist()
-        return Leg(x, y, self.angle + float(pose[2]))
 
 
 class LaneCorner(NamedTuple):
@@ -297,7 +248,7 @@ def find_corner(
         return None
     near_cm, _, far_cm = lines_cm.mean(axis=0).tolist()
     before = Leg(near_cm, ROWS_CM[0], math.atan2(far_cm - near_cm, ROWS_CM[-1] - ROWS_CM[0]))
-    borders = [_Borders.of(before, width_cm, marking_cm, edges) for marking_cm in markings_cm]
+    borders = [LegBorders.of(before, width_cm, marking_cm, edges) for marking_cm in markings_cm]
     straight = [line.seen_straight(0.5 * way * width_cm) for way, line in zip(_WAYS, borders, strict=True)]
     best, best_start_cm, best_turn = -math.inf, math.nan, math.nan
     for turn in turns:
@@ -306,7 +257,7 @@ def find_corner(
             line.seen_beyond(0.5 * way * width_cm, turn) for way, line in zip(_WAYS, borders, strict=True)
         ]
         of_inner, of_outer = seen[inner].sum(axis=1), seen[1 - inner].sum(axis=1)
-        at_corner = seen[1 - inner][:, : round(_AT_CORNER_CM / _PIECE_CM)].any(axis=1)
+        at_corner = seen[1 - inner][:, : round(_AT_CORNER_CM / PIECE_CM)].any(axis=1)
         likely = at_corner & (of_inner >= _INNER) & (of_outer >= _OUTER) & (of_inner + of_outer >= _BOTH)
         ahead_cm = 0.5 * width_cm * math.tan(0.5 * abs(turn))
         for place in np.flatnonzero(likely).tolist():
@@ -316,7 +267,7 @@ def find_corner(
                 score > best
                 and _CORNERS_CM[0] < outer_cm < _CORNERS_CM[1]
                 and (inner_cm >= _BESIDE_CM or of_inner[place] >= _INNER_BESIDE)
-                and _count(straight[1 - inner], outer_cm - _AT_CORNER_CM, outer_cm) > 0
+                and pieces_seen(straight[1 - inner], outer_cm - _AT_CORNER_CM, outer_cm) > 0
                 and not _go_straight_on(straight[inner], inner_cm, straight[1 - inner], outer_cm)
             )
             if is_corner:
@@ -342,64 +293,15 @@ def _tried_turns(hint: Corner) -> list[float]:
     return [turn + more for more in _TRIED_TURNS.tolist() if _LEAST_TURN < abs(turn + more) < _BACK]
 
 
-class _Borders(NamedTuple):
-    """Edge points moved to the middle of a marking, as a leg of the lane sees them, and their normals."""
-
-    right_cm: Float[np.ndarray, "n"]
-    along_cm: Float[np.ndarray, "n"]
-    normal_right: Float[np.ndarray, "n"]
-    normal_along: Float[np.ndarray, "n"]
-
-    @classmethod
-    def of(cls, leg: Leg, width_cm: float, marking_cm: float, edges: RoadEdges) -> _Borders:
-        """Take those about the leg."""
-        normals = edges.normals.astype(np.float64)
-        right_cm, along_cm = leg.seen_from(edges.points_cm + 0.5 * marking_cm * normals)
-        near = (along_cm > _NEAR_CM) & (along_cm < _FAR_CM) & (np.abs(right_cm) < _BESIDE * width_cm)
-        direction = Leg(0.0, 0.0, leg.angle)
-        return cls(right_cm[near], along_cm[near], *direction.seen_from(normals[near]))
-
-    def seen_straight(self, aside_cm: float) -> Bool[np.ndarray, "b"]:
-        """Return in which pieces along the leg a line is seen that many cm to the right of the middle."""
-        limit_cm = _NEAR_LINE_CM + _NEAR_LINE_GROWTH * np.abs(self.along_cm)
-        own = (np.abs(self.right_cm - aside_cm) < limit_cm) & (np.abs(self.normal_right) > _COSINE)
-        seen = np.zeros(int((_FAR_CM - _NEAR_CM) / _PIECE_CM) + 1, np.bool_)
-        seen[((self.along_cm[own] - _NEAR_CM) / _PIECE_CM).astype(np.int64)] = True
-        return seen
-
-    def seen_beyond(self, aside_cm: float, turn: float) -> Float[np.ndarray, "p b"]:
-        """Return how a line is seen in the pieces beyond each of the corners that it may have."""
-        sine, cosine = math.sin(turn), math.cos(turn)
-        # Where the line through each point that has turned leaves the straight one, along this.
-        beyond_cm = aside_cm - (self.right_cm * cosine - self.along_cm * sine)
-        leaves_cm = beyond_cm / sine - aside_cm * math.tan(0.5 * turn)
-        further_cm = (self.right_cm - aside_cm) * sine + (self.along_cm - leaves_cm) * cosine
-        facing = self.normal_right * cosine - self.normal_along * sine
-        place, piece = np.abs(beyond_cm).astype(np.int64), np.floor(further_cm / _PIECE_CM).astype(np.int64)
-        counts = (np.abs(facing) > _COSINE) & (beyond_cm * sine > 0.0) & (place < _PLACES)
-        counts &= (piece >= 0) & (piece < _PIECES)
-        borders = np.zeros((2, _PLACES, _PIECES), np.bool_)
-        borders[(facing > 0.0).astype(np.int64)[counts], place[counts], piece[counts]] = True
-        borders[:, 1:] |= borders[:, :-1].copy()
-        one, both = borders.any(axis=0), borders.all(axis=0)
-        return np.where(both, 1.0, np.where(one, _ONE_BORDER, 0.0))
-
-
 def _go_straight_on(
     inner: Bool[np.ndarray, "b"], inner_cm: float, outer: Bool[np.ndarray, "b"], outer_cm: float
 ) -> bool:
     """Return whether lines are seen straight on beyond the places of their corners."""
     near, far = (
-        [_count(inner, inner_cm + a, inner_cm + b), _count(outer, outer_cm + a, outer_cm + b)]
+        [pieces_seen(inner, inner_cm + a, inner_cm + b), pieces_seen(outer, outer_cm + a, outer_cm + b)]
         for a, b in (_BEYOND_CM, _FURTHER_CM)
     )
     return max(near) > _GOES_ON or sum(far) > _GO_ON
-
-
-def _count(seen: Bool[np.ndarray, "b"], from_cm: float, to_cm: float) -> int:
-    """Return in how many pieces a line is seen between two places along the leg."""
-    first, end = (max(round((at_cm - _NEAR_CM) / _PIECE_CM), 0) for at_cm in (from_cm, to_cm))
-    return int(np.count_nonzero(seen[first:end]))
 
 
 def _borders_of_leg(

@@ -230,7 +230,20 @@ class StraightOn:
             self._know_it()
         elif self._frames > (_FRESH if self.told else _FRESH_UNTOLD):
             self._lines_cm = None
-        if self._suspicious >= _AFTER and self._lines_cm is not None and self._driven_cm <= _FRESH_CM:
+        if self._suspicious >= _AFTER:
+            self._begin()
+
+    def begin(self, leaving: int) -> None:
+        """Continue the lane, if it was plain just now, where a line turns into a side road.
+
+        Args:
+            leaving: That line, 0 for the left one.
+        """
+        self.leaving = leaving
+        self._begin()
+
+    def _begin(self) -> None:
+        if self._lines_cm is not None and self._driven_cm <= _FRESH_CM:
             self.on, self._suspicious, self._frames = True, 0, 0
 
     def _recently_leaving(self, leaving: int | None) -> int | None:

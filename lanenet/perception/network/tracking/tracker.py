@@ -27,6 +27,7 @@ from lanenet.perception.network.tracking.lane_corner import CornerAhead, find_co
 from lanenet.perception.network.tracking.line_beside import SeenLine, WidthHere, line_beside
 from lanenet.perception.network.tracking.marking_widths import MarkingWidths
 from lanenet.perception.network.tracking.pair import Candidate, Pair, best_pair, tells_width
+from lanenet.perception.network.tracking.side_road import SideRoadAhead, find_side_road
 from lanenet.perception.network.tracking.straight_on import SeenLines, StraightOn, turns_away_cm
 from lanenet.perception.network.tracking.which_lane import WhichLane
 
@@ -150,6 +151,7 @@ class LaneTracker:
         self._which_lane = WhichLane()
         self.straight_on = StraightOn()
         self.corner = CornerAhead()
+        self.side_road = SideRoadAhead()
         #: Whether the last frame in which its lines were followed showed both beyond the label rows.
         self._goes_on = False
         self._view = view
@@ -162,6 +164,7 @@ class LaneTracker:
         self._which_lane.reset()
         self.straight_on.reset()
         self.corner.reset()
+        self.side_road.reset()
         self._goes_on = False
         self.looks.reset()
         self._width_here.reset()
@@ -252,6 +255,7 @@ class LaneTracker:
         """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`."""
         self.straight_on.moved(travel_cm, turn_rad, wheelbase_cm)
         self.corner.moved(travel_cm, turn_rad, wheelbase_cm)
+        self.side_road.moved(travel_cm)
 
     def lose(self) -> None:
         """Take a frame that shows nothing of the lane."""
@@ -435,6 +439,9 @@ class LaneTracker:
         if lines_cm is not None and not self.straight_on.on and not self._goes_on:
             hints = corners(lines_cm.tolist(), markings_cm, borders)
             found = find_corner(lines_cm, width_cm, markings_cm, hints, borders.edges)
+            if found is None and self._view is not None:
+                road = find_side_road(lines_cm, width_cm, markings_cm, borders.edges, self._view)
+                self.side_road.look(road)
         self.corner.look(found)
         return self.corner.on
 
@@ -476,11 +483,17 @@ class LaneTracker:
         points_cm = left.points_cm, right.points_cm
         lines = SeenLines(points_cm, (left.seen_cm, right.seen_cm), (left.seen_at, right.seen_at))
         bends, leaving = self._turning(pair, width_cm, borders)
+        road = self.side_road.road if self.side_road.is_here(width_cm) else None
         if self.straight_on.on:
             assert self.straight_on.leaving is not None
-            other = 1 - self.straight_on.leaving
-            goes_on = presence[other] > SURE and pair[other].seen_cm >= _WIDTH_SEEN_CM
-            self.straight_on.look_for_its_end(lines, bends or goes_on, width_cm)
+            goes_on = self._is_sure_of(1 - self.straight_on.leaving, pair, presence)
+            if road is None:
+                self.straight_on.look_for_its_end(lines, bends or goes_on, width_cm)
+        elif road is not None and not (
+            # A line that goes on has bays beside it.
+            pair[road.side].seen_to_cm >= _GOES_ON_CM or self._is_sure_of(1 - road.side, pair, presence)
+        ):
+            self.straight_on.begin(road.side)
         else:
             if bends:
                 self.straight_on.forget_turn()
@@ -488,6 +501,11 @@ class LaneTracker:
         if self.straight_on.on:
             self._look_beyond(width_cm, borders.edges)
         return self.straight_on.on
+
+    @staticmethod
+    def _is_sure_of(side: int, pair: Pair, presence: list[float]) -> bool:
+        """Return whether network and edges both show a line."""
+        return presence[side] > SURE and pair[side].seen_cm >= _WIDTH_SEEN_CM
 
     def _look_beyond(self, width_cm: float, edges: RoadEdges) -> None:
         """Turn the continued lane to where both of its lines are seen further ahead.
