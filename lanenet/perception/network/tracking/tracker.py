@@ -497,7 +497,8 @@ class LaneTracker:
         else:
             if bends:
                 self.straight_on.forget_turn()
-            self.straight_on.look(lines, leaving, presence, width_cm)
+            bent = self.side_road.bends_the_line
+            self.straight_on.look(lines, leaving, presence, width_cm, bends=bent)
         if self.straight_on.on:
             self._look_beyond(width_cm, borders.edges)
         return self.straight_on.on
