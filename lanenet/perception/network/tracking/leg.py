@@ -54,10 +54,14 @@ class Leg(NamedTuple):
         (sine, cosine), (x, y) = self.ahead, (points_cm - [self.x, self.y]).T
         return x * cosine - y * sine, x * sine + y * cosine
 
-    def at(self, right_cm: float, along_cm: float) -> Float[np.ndarray, "2"]:
-        """Return a point of the road, frame car."""
+    def on_road(self, places_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Return points of the road, frame car, by how far right of the middle and how far along it they lie."""
         sine, cosine = self.ahead
-        return np.array([self.x, self.y]) + right_cm * np.array([cosine, -sine]) + along_cm * self.ahead
+        return places_cm @ np.array([[cosine, -sine], [sine, cosine]]) + [self.x, self.y]
+
+    def at(self, right_cm: float, along_cm: float) -> Float[np.ndarray, "2"]:
+        """Return one point of the road, frame car."""
+        return self.on_road(np.array([[right_cm, along_cm]]))[0]
 
     def moved(self, pose: Float[np.ndarray, "3"], wheelbase_cm: float) -> Leg:
         """Return it as the car sees it from where it has driven to, by its pose in its own former frame."""

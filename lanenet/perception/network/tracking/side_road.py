@@ -186,7 +186,7 @@ def _turns_off_at(
     path_cm, directions = _curve(way, -0.5 * width_cm, 0.5 * width_cm, turn, at_cm, radius_cm, 0.0, 10.0)
     across_cm = 0.5 * width_cm + way * path_cm[:, 0]
     crosses = (across_cm > _OUTER_NEAR_CM) & (across_cm < width_cm + _NEAR_CM)
-    crosses &= view.shows(np.array([lane.at(*place) for place in path_cm.tolist()]))
+    crosses &= view.shows(lane.on_road(path_cm))
     if np.count_nonzero(crosses) * PIECE_CM < _OUTER * width_cm:
         return None
     other = LegBorders.of(lane, width_cm, markings_cm[1 - side], edges)

@@ -421,7 +421,7 @@ class LaneTracker:
         return starts
 
     def _at_corner(self, borders: RoadBorders) -> bool:
-        """Return whether the lane turns at once here.
+        """Look for corners and side roads ahead, and return whether the lane turns at once here.
 
         That needs the car's motion, and how wide the markings are.
         """
