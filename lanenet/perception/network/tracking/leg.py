@@ -55,7 +55,7 @@ class Leg(NamedTuple):
         return x * cosine - y * sine, x * sine + y * cosine
 
     def on_road(self, places_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Return points of the road, frame car, by how far right of the middle and how far along it they lie."""
+        """Return points of the road, frame car, by how far right of the middle and along it they lie."""
         sine, cosine = self.ahead
         return places_cm @ np.array([[cosine, -sine], [sine, cosine]]) + [self.x, self.y]
 
