@@ -64,7 +64,7 @@ def found_in(edges: RoadEdges, markings_cm: tuple[float, float] = MARKINGS_CM) -
         (45.0, 90.0, 11.0),
         (45.0, 90.0, 15.0),
         (45.0, 100.0, 15.0),
-        (60.0, 90.0, 20.0),
+        (48.0, 90.0, 20.0),
     ],
 )
 def test_a_line_that_turns_off_on_a_small_curve_is_a_side_road(at_cm, turn_deg, radius_cm, dtype):
@@ -86,7 +86,7 @@ def test_dark_tape_turns_off_as_well():
 
 def test_of_two_side_roads_the_nearer_one_is_found():
     left = turning(14.0, at_cm=35.0) * [-1.0, 1.0]
-    assert found_in(edges_of(turning(14.0, at_cm=50.0), left)) == pytest.approx(SideRoad(0, 35.0), abs=3.0)
+    assert found_in(edges_of(turning(14.0, at_cm=46.0), left)) == pytest.approx(SideRoad(0, 35.0), abs=3.0)
 
 
 def bend(inner_cm: float, width_cm: float = WIDTH_CM) -> np.ndarray:
@@ -96,6 +96,11 @@ def bend(inner_cm: float, width_cm: float = WIDTH_CM) -> np.ndarray:
         [20.0 + inner_cm - outer_cm * np.cos(angle), 45.0 - inner_cm + outer_cm * np.sin(angle)], axis=1
     )
     return np.vstack([[arc[0, 0], -10.0], arc, arc[-1] + [60.0, 0.0]])
+
+
+def sharply(radius_cm: float = 0.0) -> np.ndarray:
+    """The left line of a lane that turns by a right angle where the right one does on its curve."""
+    return turning(radius_cm, 85.0, on_cm=100.0) - [40.0, 0.0]
 
 
 def dashes(path_cm: np.ndarray, dash_cm: float, gap_cm: float) -> list[np.ndarray]:
@@ -118,6 +123,16 @@ BAYS = [np.array([[20.0, y], [50.0, y]]) for y in (25.0, 60.0)]
         pytest.param(edges_of(turning(14.0), bend(14.0)), id="a tight bend"),
         pytest.param(edges_of(turning(14.0), *dashes(bend(14.0), 6.0, 6.0)), id="its outer line is dashed"),
         pytest.param(edges_of(turning(14.0), bend(14.0, 37.0)), id="a lane that narrows in a bend"),
+        pytest.param(edges_of(turning(14.0, 44.0), bend(14.0, 47.0)), id="a lane that widens in a bend"),
+        pytest.param(edges_of(turning(14.0), sharply()), id="the outer line turns at once"),
+        pytest.param(edges_of(turning(14.0), sharply(14.0)), id="both lines on the same radius"),
+        pytest.param(
+            edges_of(turning(14.0, 60.0), LEFT_ENDS), id="an outer line would be too far to be seen"
+        ),
+        pytest.param(
+            edges_of(turning(14.0), LEFT_ENDS, np.array([[-70.0, 85.0], [70.0, 85.0]])),
+            id="a T, two lanes on",
+        ),
         pytest.param(edges_of(turning(0.0), LEFT_ENDS), id="a corner of tape"),
         pytest.param(edges_of(turning(35.0), LEFT_ENDS), id="a wide bend without its outer line"),
         pytest.param(edges_of(turning(14.0, turn_deg=55.0), LEFT_ENDS), id="a line that turns by less"),
@@ -144,7 +159,7 @@ def test_where_the_outer_line_of_a_bend_would_be_out_of_view_it_is_no_side_road(
 def look(road: SideRoadAhead, *seen_cm: float, travel_cm: float = 3.0) -> bool:
     """Show one side road after another, with the car's way between, and return whether it is believed."""
     for ahead_cm in seen_cm:
-        road.moved(travel_cm)
+        road.moved(travel_cm, 0.0)
         road.look(SideRoad(1, ahead_cm))
     return road.is_here(WIDTH_CM)
 
@@ -161,7 +176,7 @@ def test_a_standing_car_sees_the_same_again():
 def test_one_on_the_other_side_is_another_one():
     road = SideRoadAhead()
     look(road, 33.0)
-    road.moved(3.0)
+    road.moved(3.0, 0.0)
     road.look(SideRoad(0, 30.0))
     assert not road.is_here(WIDTH_CM)
 
@@ -171,16 +186,36 @@ def test_it_is_here_from_shortly_before_it_until_a_lane_width_beyond():
     assert not look(road, 60.0, 57.0)
     here = []
     for _ in range(40):
-        road.moved(3.0)
+        road.moved(3.0, 0.0)
         assert road.road is not None
         here.append((road.road.ahead_cm, road.is_here(WIDTH_CM)))
     assert [at for at, _ in here if -40.0 < at < 36.0] == [at for at, is_here in here if is_here]
 
 
+def test_frames_without_it_speak_against_it():
+    road = SideRoadAhead()
+    assert look(road, 33.0, 30.0)
+    for _ in range(3):
+        road.look(None)
+    assert road.is_here(WIDTH_CM)
+    road.look(None)
+    assert not road.is_here(WIDTH_CM) and road.road is None
+
+
+def test_a_car_that_turns_away_passes_none():
+    road = SideRoadAhead()
+    look(road, 33.0, 30.0)
+    for _ in range(5):
+        road.moved(1.0, 0.15)
+    assert road.is_here(WIDTH_CM)
+    road.moved(1.0, 0.15)
+    assert road.road is None
+
+
 def test_a_way_that_is_not_known_makes_it_unknown():
     road = SideRoadAhead()
     look(road, 33.0, 30.0)
-    road.moved(math.nan)
+    road.moved(math.nan, 0.0)
     assert not road.is_here(WIDTH_CM)
 
 
@@ -223,6 +258,37 @@ def test_without_the_cars_motion_no_side_road_is_looked_for():
 @pytest.mark.parametrize("kind", ["sure_of_left", "goes_on"])
 def test_where_a_line_of_the_lane_is_sure_the_lane_is_followed(kind):
     assert not len(drive(LaneTracker(LaneMemory(WIDTH_CM), view=VIEW), **{kind: True}))
+
+
+def past_a_side_road() -> LaneTracker:
+    """A tracker that continues the lane beside a side road."""
+    tracker = LaneTracker(LaneMemory(WIDTH_CM), view=VIEW)
+    for at_cm in np.arange(80.0, 20.0, -3.0):
+        tracker.moved(3.0, 0.0, WHEELBASE_CM)
+        edges = edges_of(line(-20.0, -10.0, max(at_cm - 5.0, 0.0)), turning(14.0, at_cm))
+        presence = np.array([1.0 if at_cm > 40.0 else 0.8, 1.0])
+        tracker.follow(LANE.reshape(6), np.full(6, 1.0), presence, edges)
+        if tracker.straight_on.on:
+            return tracker
+    raise AssertionError("no side road was believed")
+
+
+def test_a_line_that_is_surely_seen_for_long_ends_it():
+    tracker, frames = past_a_side_road(), 0
+    bent = LANE + np.array([0.0, 4.0, 16.0])
+    while tracker.straight_on.on:
+        tracker.moved(1.0, 0.0, WHEELBASE_CM)
+        curve = np.stack([-20.0 + 16.0 * (np.arange(40.0) / 30.0) ** 2, np.arange(40.0)], axis=1)
+        tracker.follow(bent.reshape(6), np.full(6, 1.0), np.ones(2), edges_of(curve))
+        frames += 1
+    assert frames == 8
+
+
+def test_a_caller_that_stops_telling_the_cars_motion_is_not_sent_straight_on_for_ever():
+    tracker, nothing = past_a_side_road(), RoadEdges(np.empty((0, 2)), np.empty((0, 2)))
+    for _ in range(41):
+        tracker.follow(LANE.reshape(6), np.full(6, 1.0), np.zeros(2), nothing)
+    assert not tracker.straight_on.on
 
 
 def test_a_reset_forgets_the_side_road():

@@ -1,7 +1,7 @@
 """The mouth of a side road: one line turns off at a right angle, and the lane goes straight on.
 
 Only the shape tells it from a bend of the lane, where the other line is in glare or worn: a line turns into a
-side road on a small curve, and nothing lies across the lane where a bend would have its outer line.
+side road on a small curve, and nothing crosses the lane, as the outer line of a bend would.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lanenet.perception.network.tracking.leg import PIECE_CM, Leg, LegBorders, p
 _TURNS = np.radians([75.0, 80.0, 85.0, 90.0, 95.0, 100.0, 105.0])
 _SHARP_CM, *_CURVES_CM = _RADII_CM = (0.0, 8.0, 14.0, 20.0)
 #: Where the line would turn if it did so at once, along the lane, [cm].
-_PLACES_CM = (4.0, 85.0)
+_AT_CM = (4.0, 85.0)
 #: In so many pieces it has to be seen before the curve, over so many cm, and beyond it. Chosen.
 _BEFORE, _BEFORE_CM, _BEYOND = 2, 12.0, 6.0
 #: Between these distances beyond, both of its borders may be seen in at most this share of the pieces of a
@@ -33,12 +33,18 @@ _ON_CM, _ON, _BENDS = (4.0, 20.0), 0.35, (0.0, 1.0 / 150.0)
 #: Which share has to be seen of the curve, with so many cm to each side of where the line would turn at once,
 #: and how much larger it has to be than if it did.
 _SEEN, _ABOUT_CM, _ROUNDER = 0.8, 24.0, 0.1
-#: Of the outer line that a bend would have at most this share may be seen where it crosses the lane, of so
-#: many cm at least that are in the image. In every second frame of 160 roads of one seed, on which all this
-#: was chosen, 52 side roads are found twice, and no bend is; with 0.2 fewer roads, with 0.3 one bend.
-_OUTER_SEEN, _OUTER = 0.25, 0.8
-#: How far beside a line its borders count, [cm], and beside where that of a bend would be; and how far about
-#: all that any do.
+#: Where a bend would have its outer line, this share of it has to be in the image; markings may be seen to
+#: cross the lane over at most this share of its width, up to so many widths beyond where the line would turn
+#: at once.
+_IN_VIEW, _CROSSED, _BEND = 0.7, 0.1, 1.4
+#: So far ahead edges are still seen well enough for that, [cm]. Chosen.
+_FARTHEST_CM = 90.0
+#: A marking crosses the lane whose normal has at least this part along it; its borders meet, moved by half
+#: its width, within this distance, [cm], with normals that are at least that opposite. As for corners of
+#: tape.
+_CROSSES, _MEET_CM, _OPPOSITE = 0.35, 1.3, -0.8
+#: How far beside a line its borders count, [cm], and beside the lane's lines nothing that crosses does; and
+#: how far about all that any do.
 _NEAR_CM, _OUTER_NEAR_CM, _AROUND_CM = 1.8, 4.0, 3.0
 #: There is no side road without so many borders across the lane's direction, between these distances beside
 #: it, [cm], with such normals. Chosen.
@@ -46,6 +52,11 @@ _LEAST, _ASIDE_CM, _ACROSS = 25, (5.0, 45.0), 0.85
 #: Two findings are the same side road within this distance, [cm]; one that was found so often is believed, if
 #: the car drove on so far between, [cm]. Chosen: as for corners.
 _SAME_CM, _BELIEVED, _APART_CM = 6.0, 2, 1.0
+#: So many times as many frames without it as with it, and it is forgotten. Chosen: glare hides it now and
+#: then.
+_MISSED = 2
+#: By how much the car may turn after it was found, [rad]. Chosen: more than bends turn over a lane's width.
+_AWAY = 0.8
 #: The lane is continued from this distance on, [cm], where its line has turned off at the last label row,
 #: until it lies so many lane widths behind. Chosen: mouths are wider.
 _BEGINS_CM, _BEHIND = 36.0, 1.0
@@ -77,19 +88,32 @@ class SideRoadAhead:
     def reset(self) -> None:
         """Forget what earlier frames showed."""
         self.road: SideRoad | None = None
-        self._found = 0
-        self._driven_cm = 0.0
+        self._found = self._missed = 0
+        self._driven_cm = self._turned_rad = 0.0
 
-    def moved(self, travel_cm: float) -> None:
-        """Take the distance that the car drove since the last frame, [cm]."""
+    def moved(self, travel_cm: float, turn_rad: float) -> None:
+        """Take the car's motion since the last frame: how far it drove, and by how much it turned.
+
+        A car that has turned away from the lane passes no side road of it.
+        """
         if self.road is None:
             return
         self.road = self.road._replace(ahead_cm=self.road.ahead_cm - travel_cm)
         self._driven_cm += abs(travel_cm)
+        self._turned_rad += turn_rad
+        # Not a number where the motion is none.
+        if not (abs(self._turned_rad) <= _AWAY and math.isfinite(self.road.ahead_cm)):
+            self.reset()
 
     def look(self, found: SideRoad | None) -> None:
-        """Take a frame in which the lane is not continued: what :func:`find_side_road` found in it."""
+        """Take a frame in which the lane is not continued: what :func:`find_side_road` found in it.
+
+        One that finds nothing speaks against what an earlier one found.
+        """
         if found is None:
+            self._missed += 1
+            if self._missed >= _MISSED * self._found:
+                self.reset()
             return
         again = (
             self.road is not None
@@ -98,7 +122,8 @@ class SideRoadAhead:
         )
         if not again or self._driven_cm >= _APART_CM:
             self._found, self._driven_cm = self._found + 1 if again else 1, 0.0
-        self.road = found
+            self._missed = self._missed if again else 0
+        self.road, self._turned_rad = found, 0.0
 
     @property
     def bends_the_line(self) -> bool:
@@ -165,7 +190,7 @@ def _turns_off_at(
         # Places are told by where the lane's middle would turn.
         first_cm = 0.5 * width_cm * math.tan(0.5 * tried)
         places_cm = np.arange(len(beyond)) / math.sin(tried) - first_cm
-        beyond[(places_cm < _PLACES_CM[0]) | (places_cm > _PLACES_CM[1])] = 0.0
+        beyond[(places_cm < _AT_CM[0]) | (places_cm > _AT_CM[1])] = 0.0
         place = int(beyond.argmax())
         if beyond[place] > best:
             best, turn, at_cm = float(beyond[place]), tried, float(places_cm[place])
@@ -182,16 +207,32 @@ def _turns_off_at(
         return None
     if _goes_on(own, way, width_cm, at_cm):
         return None
-    # The outer line of such a bend, where it crosses the lane, but not where it would lie straight on.
-    path_cm, directions = _curve(way, -0.5 * width_cm, 0.5 * width_cm, turn, at_cm, radius_cm, 0.0, 10.0)
-    across_cm = 0.5 * width_cm + way * path_cm[:, 0]
-    crosses = (across_cm > _OUTER_NEAR_CM) & (across_cm < width_cm + _NEAR_CM)
-    crosses &= view.shows(lane.on_road(path_cm))
-    if np.count_nonzero(crosses) * PIECE_CM < _OUTER * width_cm:
+    # The outer line of such a bend crosses the lane, at the latest where it turns at once, too.
+    if at_cm + width_cm * math.tan(0.5 * turn) > _FARTHEST_CM:
+        return None
+    outer_cm = _curve(way, -0.5 * width_cm, 0.5 * width_cm, turn, at_cm, radius_cm, 0.0, 10.0)[0]
+    in_lane = outer_cm[np.abs(outer_cm[:, 0]) < 0.5 * width_cm]
+    if view.shows(lane.on_road(in_lane)).mean() < _IN_VIEW:
         return None
     other = LegBorders.of(lane, width_cm, markings_cm[1 - side], edges)
-    outer = other.seen_along(path_cm[crosses], directions[crosses], _OUTER_NEAR_CM)
-    return at_cm if outer.mean() <= _OUTER_SEEN else None
+    crossed = _crossed(other, way, width_cm, begins_cm, at_cm + _BEND * width_cm)
+    return at_cm if crossed <= _CROSSED else None
+
+
+def _crossed(other: LegBorders, way: float, width_cm: float, from_cm: float, to_cm: float) -> float:
+    """Return over which share of its width markings are seen to cross a lane, between two places."""
+    across_cm = 0.5 * width_cm + way * other.right_cm
+    here = (across_cm > _OUTER_NEAR_CM) & (across_cm < width_cm - _OUTER_NEAR_CM)
+    here &= (other.along_cm > from_cm) & (other.along_cm < to_cm) & (np.abs(other.normal_along) > _CROSSES)
+    right_cm, along_cm, normal_right, normal_along = other.where(here)
+    apart2 = (right_cm - right_cm[:, None]) ** 2 + (along_cm - along_cm[:, None]) ** 2
+    opposite = normal_right * normal_right[:, None] + normal_along * normal_along[:, None] < _OPPOSITE
+    of_marking = (opposite & (apart2 < _MEET_CM * _MEET_CM)).any(axis=1)
+    pieces = max(1, int((width_cm - 2.0 * _OUTER_NEAR_CM) / PIECE_CM))
+    seen = np.zeros(pieces, np.bool_)
+    piece = ((across_cm[here][of_marking] - _OUTER_NEAR_CM) / PIECE_CM).astype(np.int64)
+    seen[np.minimum(piece, pieces - 1)] = True
+    return float(seen.mean())
 
 
 def _goes_on(own: LegBorders, way: float, width_cm: float, at_cm: float) -> bool:

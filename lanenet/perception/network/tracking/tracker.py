@@ -255,7 +255,7 @@ class LaneTracker:
         """Take the car's motion since the last frame, as :class:`lanenet.perception.estimate.TakesMotion`."""
         self.straight_on.moved(travel_cm, turn_rad, wheelbase_cm)
         self.corner.moved(travel_cm, turn_rad, wheelbase_cm)
-        self.side_road.moved(travel_cm)
+        self.side_road.moved(travel_cm, turn_rad)
 
     def lose(self) -> None:
         """Take a frame that shows nothing of the lane."""
@@ -429,6 +429,7 @@ class LaneTracker:
         markings_cm = self._known_markings_cm() if self.straight_on.told else None
         if width_cm is None or markings_cm is None:
             self.corner.reset()
+            self.side_road.reset()
             return False
         if self.corner.on:
             goes_on = self.corner.follow(markings_cm, borders.edges)
@@ -450,6 +451,7 @@ class LaneTracker:
     ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
         """Answer with the lane that turns at once."""
         self.straight_on.forget_lane()
+        self.side_road.reset()
         self._last = self._rival = None
         self._goes_on = False
         self._width_here.look(None)
@@ -486,19 +488,20 @@ class LaneTracker:
         road = self.side_road.road if self.side_road.is_here(width_cm) else None
         if self.straight_on.on:
             assert self.straight_on.leaving is not None
-            goes_on = self._is_sure_of(1 - self.straight_on.leaving, pair, presence)
-            if road is None:
-                self.straight_on.look_for_its_end(lines, bends or goes_on, width_cm)
-        elif road is not None and not (
-            # A line that goes on has bays beside it.
-            pair[road.side].seen_to_cm >= _GOES_ON_CM or self._is_sure_of(1 - road.side, pair, presence)
-        ):
-            self.straight_on.begin(road.side)
+            found = self._is_sure_of(1 - self.straight_on.leaving, pair, presence)
+            passes = road is not None
+            self.straight_on.look_for_its_end(lines, found or (bends and not passes), width_cm, passes=passes)
         else:
             if bends:
                 self.straight_on.forget_turn()
-            bent = self.side_road.bends_the_line
-            self.straight_on.look(lines, leaving, presence, width_cm, bends=bent)
+            # A line that goes on has bays beside it.
+            if road is not None and not (
+                pair[road.side].seen_to_cm >= _GOES_ON_CM or self._is_sure_of(1 - road.side, pair, presence)
+            ):
+                self.straight_on.begin(road.side)
+            if not self.straight_on.on:
+                bent = self.side_road.bends_the_line
+                self.straight_on.look(lines, leaving, presence, width_cm, bends=bent)
         if self.straight_on.on:
             self._look_beyond(width_cm, borders.edges)
         return self.straight_on.on
