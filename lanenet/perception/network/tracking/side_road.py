@@ -125,11 +125,6 @@ class SideRoadAhead:
             self._missed = self._missed if again else 0
         self.road, self._turned_rad = found, 0.0
 
-    @property
-    def bends_the_line(self) -> bool:
-        """Whether the line that turns off may do so within the label rows."""
-        return self.road is not None and 0.0 < self.road.ahead_cm < ROWS_CM[-1] + _CURVES_CM[-1]
-
     def is_here(self, width_cm: float) -> bool:
         """Return whether the car passes it, or is about to, in a lane of that width."""
         return (

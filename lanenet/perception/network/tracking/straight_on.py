@@ -202,15 +202,7 @@ class StraightOn:
             return False
         return abs(points_cm[_MIDDLE] - float(self._lines_cm[side, _MIDDLE])) >= _SAME * width_cm
 
-    def look(
-        self,
-        lines: SeenLines,
-        leaving: int | None,
-        presence: Sequence[float],
-        width_cm: float,
-        *,
-        bends: bool = False,
-    ) -> None:
+    def look(self, lines: SeenLines, leaving: int | None, presence: Sequence[float], width_cm: float) -> None:
         """Take a frame while the lane is not continued.
 
         Args:
@@ -218,7 +210,6 @@ class StraightOn:
             leaving: The one that turns away, while the other one, which would be in sight, does not.
             presence: Probability of each line, by the network.
             width_cm: The lane's width.
-            bends: Whether one may begin to turn into a side road at the last label row.
         """
         leaves = leaving is not None
         for side, seen_cm in enumerate(lines.seen_cm):
@@ -234,7 +225,7 @@ class StraightOn:
         self._frames += 1
         if not leaves and self._suspicious == 0 and _is_plain(lines, width_cm):
             # Their direction 15 cm ahead, as far as both are seen.
-            far = _FAR if all(at[_FAR] for at in lines.seen_at) and not bends else _MIDDLE
+            far = _FAR if all(at[_FAR] for at in lines.seen_at) else _MIDDLE
             left, right = lines.points_cm
             slope = 0.5 * (left[far] - left[0] + (right[far] - right[0])) / ROWS_CM[far]
             ahead_cm = [slope * (row - ROWS_CM[_MIDDLE]) for row in ROWS_CM]

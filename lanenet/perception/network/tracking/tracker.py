@@ -500,8 +500,7 @@ class LaneTracker:
             ):
                 self.straight_on.begin(road.side)
             if not self.straight_on.on:
-                bent = self.side_road.bends_the_line
-                self.straight_on.look(lines, leaving, presence, width_cm, bends=bent)
+                self.straight_on.look(lines, leaving, presence, width_cm)
         if self.straight_on.on:
             self._look_beyond(width_cm, borders.edges)
         return self.straight_on.on
