@@ -246,8 +246,7 @@ def find_corner(
     turns = [turn for hint in hints if hint is not None for turn in _tried_turns(hint)]
     if not turns:
         return None
-    near_cm, _, far_cm = lines_cm.mean(axis=0).tolist()
-    before = Leg(near_cm, ROWS_CM[0], math.atan2(far_cm - near_cm, ROWS_CM[-1] - ROWS_CM[0]))
+    before = Leg.between(lines_cm)
     borders = [LegBorders.of(before, width_cm, marking_cm, edges) for marking_cm in markings_cm]
     straight = [line.seen_straight(0.5 * way * width_cm) for way, line in zip(_WAYS, borders, strict=True)]
     best, best_start_cm, best_turn = -math.inf, math.nan, math.nan

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lanenet.geometry.frames import car_from_map, map_from_car, wrap_angle
+from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges.road import RoadEdges
 
 #: What is looked at about a leg: y along it, [cm], and how far beside it, in widths.
@@ -36,6 +37,12 @@ class Leg(NamedTuple):
     x: float
     y: float
     angle: float
+
+    @classmethod
+    def between(cls, lines_cm: Float[np.ndarray, "2 3"]) -> Leg:
+        """Take the straight lane between two lines, given by x at the label rows, frame car."""
+        near_cm, _, far_cm = lines_cm.mean(axis=0).tolist()
+        return cls(near_cm, ROWS_CM[0], math.atan2(far_cm - near_cm, ROWS_CM[-1] - ROWS_CM[0]))
 
     @property
     def away_rad(self) -> float:

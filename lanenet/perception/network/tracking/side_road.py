@@ -18,10 +18,9 @@ from lanenet.perception.edges.road import RoadEdges
 from lanenet.perception.network.tracking.camera_view import CameraView
 from lanenet.perception.network.tracking.leg import PIECE_CM, Leg, LegBorders, pieces_seen
 
-#: Angles by which the line may turn, [rad], and radii of its curve, [cm]; the first one is a corner of tape,
-#: which is none of a side road. Chosen.
+#: Angles by which the line may turn, [rad], and radii of its curve, [cm]. Chosen.
 _TURNS = np.radians([75.0, 80.0, 85.0, 90.0, 95.0, 100.0, 105.0])
-_SHARP_CM, *_CURVES_CM = _RADII_CM = (0.0, 8.0, 14.0, 20.0)
+_RADII_CM = (8.0, 14.0, 20.0)
 #: Where the line would turn if it did so at once, along the lane, [cm].
 _AT_CM = (4.0, 85.0)
 #: In so many pieces it has to be seen before the curve, over so many cm, and beyond it. Chosen.
@@ -153,8 +152,7 @@ def find_side_road(
     Returns:
         The side road; None if there is none.
     """
-    near_cm, _, far_cm = lines_cm.mean(axis=0).tolist()
-    lane = Leg(near_cm, ROWS_CM[0], math.atan2(far_cm - near_cm, ROWS_CM[-1] - ROWS_CM[0]))
+    lane = Leg.between(lines_cm)
     found = []
     for side in range(len(SIDES)):
         ahead_cm = _turns_off_at(side, lane, width_cm, markings_cm, edges, view)
@@ -192,10 +190,13 @@ def _turns_off_at(
     if best < _BEYOND:
         return None
     near = own.where(np.hypot(beside_cm, own.along_cm - at_cm) < _ABOUT_CM + _AROUND_CM)
-    sharp, *seen = (_seen_of_curve(near, way, width_cm, turn, at_cm, radius_cm) for radius_cm in _RADII_CM)
+    # Without a curve it is a corner of tape.
+    sharp, *seen = (
+        _seen_of_curve(near, way, width_cm, turn, at_cm, radius_cm) for radius_cm in (0.0, *_RADII_CM)
+    )
     if max(seen) < max(_SEEN, sharp + _ROUNDER):
         return None
-    radius_cm = _CURVES_CM[seen.index(max(seen))]
+    radius_cm = _RADII_CM[seen.index(max(seen))]
     begins_cm = at_cm - radius_cm * math.tan(0.5 * turn)
     straight = own.seen_straight(0.5 * way * width_cm)
     if pieces_seen(straight, begins_cm - _BEFORE_CM, begins_cm) < _BEFORE:
