@@ -39,7 +39,7 @@ class NetworkSettings(Settings):
         hidden: Width of the fully connected layer before the outputs; None takes that of the kind.
         bins: The network answers each point as a distribution over this many places from the left to the
             right end of the window; 0 as a number with its sigma. The default was compared with numbers in
-            docs/learning.md ("Loss"): RMSE 0.45 cm against 0.51 cm. Without bins for ``alexnet``.
+            docs/learning.md ("Choices"): RMSE 0.45 cm against 0.51 cm. Without bins for ``alexnet``.
         planes: How many planes of a raster it sees, see :data:`lanenet.perception.edges.raster.PLANES`: 1 for
             edges alone, 5 for their directions and colours too.
         takes_width: The network can be given the lane width beside the raster. Where lanes of many widths are
@@ -91,7 +91,7 @@ class NetworkSettings(Settings):
 class LossSettings(Settings):
     """What the training minimises; see :func:`lanenet.learn.loss.lane_loss`.
 
-    The comparisons behind the defaults are in docs/learning.md, "Loss".
+    The comparisons behind the defaults are in docs/learning.md, "Choices".
 
     Attributes:
         distance: For a network with bins, weight of the distance of the points, and of the likelihood of
@@ -119,9 +119,8 @@ class LearnSettings(Settings):
         epochs: Passes over the training samples, at most. 12 suits a trial; the shipped configs name theirs.
         patience: The training ends after this many epochs in a row without a better validation error; 0 never
             ends it early.
-        batch_size: Samples per step. Chosen; on one's own road 32 was better than 64 (docs/learning.md).
-        learning_rate: Peak of the learning rate (AdamW). Chosen; 0.0055 gave the same RMSE (docs/learning.md,
-            "Search").
+        batch_size: Samples per step. Chosen; on one's own road 32 was better than 64.
+        learning_rate: Peak of the learning rate (AdamW). Chosen; 0.0055 gave the same RMSE.
         head_rate: Factor on the learning rate of a new head on a pretrained trunk (the paper's 10).
         weight_decay: Of AdamW, on the weights but not on biases and norms. PyTorch's default.
         warmup: Share of all steps over which the learning rate rises from zero; a cosine lowers it

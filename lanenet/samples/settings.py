@@ -11,8 +11,7 @@ from lanenet.config import Settings
 #: How often each label set is shown in an epoch: in proportion to its frames, or as often as every other one.
 Balance = Literal["none", "drive"]
 
-#: Named amounts of augmentation. Measured on the validation lap of garage_tape: docs/learning.md, "On one's
-#: own road".
+#: Named amounts of augmentation. Chosen on the validation lap of garage_tape: docs/learning.md, "Results".
 _PRESETS: dict[str, dict[str, object]] = {
     # For one car on its road, in one direction: the camera was found from the drive itself, and the frames
     # show the clutter that there is.
@@ -39,7 +38,7 @@ class AugmentSettings(Settings):
     """How a sample is changed before it becomes a raster; all of it in cm, on the edge points.
 
     The defaults are for a network that meets other cars and roads; they were chosen, and what some of them
-    bring was measured in docs/learning.md. ``preset: own_road`` stands for less, for one car on its own road,
+    bring was measured in docs/learning.md ("Choices"). ``preset: own_road`` stands for less, for one car on its own road,
     ``preset: none`` for frames as they are; keys beside it change that. Once read, only the values are left.
 
     Attributes:

@@ -16,7 +16,7 @@ from lanenet.data.drives import find_format, formats_text, meant_instead, open_d
 from lanenet.errors import ConfigError, DriveFormatError, LanenetError
 
 #: Steps of the training, and samples of each. From configs/finetune.yaml, whose 60 epochs on the early laps
-#: of garage_tape are 1,600 steps (docs/learning.md).
+#: of garage_tape are 1,600 steps.
 _STEPS, _BATCH = 1600, 32
 #: Share of the frames that is learned from: that of the split along time, and three of five laps.
 TRAIN_SHARE = 0.6

@@ -66,7 +66,7 @@ _HIDDEN = 0.08
 #: line's own sigma was too large where line and network agree, and too small elsewhere: on 144 simulated
 #: drives of six seeds the mean pinball loss of 72 and 94 %, which lie between those of a normal distribution
 #: and what heavy tails leave, is 0.30 instead of 0.36. A share of 0.55 fits these best, but real roads are
-#: harder: see docs/learning.md.
+#: harder: see docs/studies.md.
 _CLAIMED, _LABEL_CM = 0.62, 0.2
 #: What it costs at most that a marking has another hue than its line had. Tried: 0, 15 and 40, which makes up
 #: for a line and loses those in the light of a lamp.

@@ -19,7 +19,7 @@ _NEAR_LINE = 0.25
 #: afterwards is the car's lane when both of its lines are shown, or after so many frames more. Of 35 times
 #: that a lane was found again beside a single line on 216 simulated drives of nine seeds, seven were 8 to
 #: 40 cm off (RMSE); the 35 were 0.6 % of the points, and 27 % of the squared errors. Tried: lost after 2
-#: frames, found after 6, 8 or 25 more; see docs/learning.md.
+#: frames, found after 6, 8 or 25 more; see docs/studies.md.
 _LOST_FRAMES, _SOUGHT_FRAMES = 3, 12
 
 
