@@ -38,8 +38,9 @@ class AugmentSettings(Settings):
     """How a sample is changed before it becomes a raster; all of it in cm, on the edge points.
 
     The defaults are for a network that meets other cars and roads; they were chosen, and what some of them
-    bring was measured in docs/learning.md ("Choices"). ``preset: own_road`` stands for less, for one car on its own road,
-    ``preset: none`` for frames as they are; keys beside it change that. Once read, only the values are left.
+    bring was measured in docs/learning.md ("Choices"). ``preset: own_road`` stands for less, for one car on
+    its own road, ``preset: none`` for frames as they are; keys beside it change that. Once read, only the
+    values are left.
 
     Attributes:
         mirror: Probability that left and right are swapped.
