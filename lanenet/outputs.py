@@ -35,6 +35,9 @@ if sys.platform != "win32":
 _RENAME_EXCHANGE, _AT_FDCWD = 2, -100
 #: What a kernel, a file system or a sandbox answers that does not know a call.
 _UNKNOWN_CALL = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOLCK, errno.EPERM)
+#: So often the folder of an output is made again that is gone when its lock is. Chosen: other runs remove it
+#: once each.
+_TRIES = 100
 #: Locks held by this process: process, thread and output. A forked child inherits the list, not the locks.
 _held: set[tuple[int, int, Path]] = set()
 #: Temporary files and folders that this process fills.
@@ -240,13 +243,17 @@ def _lock(path: Path, stack: ExitStack) -> bool:
         return False
     user_path = hashlib.sha256(f"{os.getuid()} {path}".encode()).hexdigest()[:16]
     fallback = Path(tempfile.gettempdir()) / f"lanenet-{user_path}.lock"
-    shared = True
+    shared, tries = True, 0
     while True:
         _make_parents(path, stack)
         lock = path.with_name(f".{path.name}.lock") if shared else fallback
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-        except FileNotFoundError:  # another run has just removed the empty folder
+        except FileNotFoundError:
+            # Another run has just removed the empty folder; or nothing can be made in it, as in /proc.
+            tries += 1
+            if tries >= _TRIES:
+                raise
             continue
         with ExitStack() as opened:
             opened.callback(os.close, handle)

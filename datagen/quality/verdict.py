@@ -250,7 +250,7 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     found = [finding for check in checks for finding in check(evidence, settings)]
     # The worst first.
     found.sort(key=lambda finding: -_ORDER.index(finding.grade))
-    remarks, opened = tuple(_remarks(evidence)), _open_text(evidence)
+    remarks, opened = tuple(_remarks(evidence, settings)), _open_text(evidence)
     withheld = _withheld_text(evidence.withheld)
     if found:
         worst = found[0]
@@ -299,7 +299,7 @@ def _open_text(e: MapEvidence) -> str:
     return ""
 
 
-def _remarks(e: MapEvidence) -> Iterator[str]:
+def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
     """What a person can check who has the car and the road before them."""
     if e.steering is not None and e.steering < 0.0:
         yield (
@@ -318,7 +318,7 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
         return
     follows = f"the camera is {e.height_cm:.1f} cm high and the tape {e.tape_cm:.1f} cm wide"
     if e.given_height_cm is not None or e.given_tape_cm is not None:
-        yield f"with the given lane width {follows}"
+        yield f"with the given lane width {follows}{_compared(e, s)}"
         return
     if any(_other_width(e)):  # a finding, which asks already
         return
@@ -327,6 +327,31 @@ def _remarks(e: MapEvidence) -> Iterator[str]:
         "thing that sets the scale: if it is wrong, every length is wrong by the same share, and no check "
         "here can show it; --tape-width or --camera-height, measured with a ruler, would"
     )
+
+
+def _compared(e: MapEvidence, s: VerdictSettings) -> str:
+    """Say how the lengths that were measured differ from those that follow, and what they cannot show."""
+    text = ""
+    for what, given, value in (
+        ("height", e.given_height_cm, e.height_cm),
+        ("tape", e.given_tape_cm, e.tape_cm),
+    ):
+        if given is not None:
+            text += f"; a {what} of {given:g} cm was measured, so that it comes out {_off(value / given)}"
+    if e.given_height_cm is None:
+        text += (
+            f". Borders of tape blur, so that this shows a wrong lane width from about "
+            f"{_percent(s.tape_mismatch)} on; is it right that the camera is {e.height_cm:.1f} cm high? "
+            f"--camera-height shows {_percent(s.height_mismatch)}"
+        )
+    return text
+
+
+def _off(ratio: float) -> str:
+    """Say by how much a length differs from the one that was measured."""
+    if round(100.0 * abs(ratio - 1.0)) == 0:
+        return "the same"
+    return f"{_percent(abs(ratio - 1.0))} {'larger' if ratio > 1.0 else 'smaller'}"
 
 
 def _bounded(value: float, bound: float, settings: VerdictSettings) -> Grade:

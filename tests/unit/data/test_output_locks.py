@@ -117,6 +117,22 @@ def test_the_holder_may_take_its_lock_again_and_nobody_else(tmp_path: Path) -> N
     assert in_a_thread(out) == ""
 
 
+def test_a_folder_in_which_nothing_can_be_made_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As /proc, which is a folder that can be entered, and in which no file can be made."""
+    whole = os.open
+
+    def no_lock(path: Path, *more: int) -> int:
+        if Path(path).name.endswith(".lock"):
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory", str(path))
+        return whole(path, *more)
+
+    monkeypatch.setattr(os, "open", no_lock)
+    with pytest.raises(LanenetError, match="map: cannot be written"), lock_output(tmp_path / "map"):
+        raise AssertionError("it has no lock")
+
+
 def test_folders_made_for_a_lock_go_again(tmp_path: Path) -> None:
     with lock_output(tmp_path / "deep" / "er" / "out"):
         assert (tmp_path / "deep" / "er").is_dir()

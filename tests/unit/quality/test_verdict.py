@@ -118,7 +118,14 @@ def test_a_height_or_a_tape_that_was_measured_checks_the_lane_width(given, bound
     found = graded(GOOD, height_cm=17.0, tape_cm=1.9, **given)
     assert found.grade == ("good" if bound is None else "usable")
     # The lane width is no longer the one thing that sets the scale.
-    assert len(found.remarks) == 1
+    (remark,) = found.remarks
+    share = {17.9: "5 % smaller", 19.0: "11 % smaller", 2.2: "14 % smaller", 3.8: "50 % smaller"}
+    assert all(
+        f"{value:g} cm was measured, so that it comes out {share[value]}" in remark
+        for value in given.values()
+    )
+    # Tape alone is no close check.
+    assert ("is it right that the camera is 17.0 cm high?" in remark) == ("given_tape_cm" in given)
     if bound is not None:
         assert bound in found.reasons[0] and all(f"{v:g} cm" in found.sentence for v in given.values())
 
