@@ -77,6 +77,16 @@ def test_the_installed_command_answers() -> None:
         assert verb in result.stdout
 
 
+def test_a_folder_of_the_clones_name_beside_a_script_does_not_hide_the_package(tmp_path: Path) -> None:
+    (tmp_path / "lanenet").mkdir()
+    script = tmp_path / "script.py"
+    script.write_text("import lanenet\nprint(lanenet.load.__module__)\n")
+    run = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert run.stdout.startswith("lanenet")
+
+
 def test_an_unknown_verb_is_refused() -> None:
     result = CliRunner().invoke(app, ["trian"], env=TERMINAL)
     assert result.exit_code == 2
