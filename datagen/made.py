@@ -46,10 +46,17 @@ class Output:
     """A file that is made from something, and the :func:`key_of` that something.
 
     A folder is represented by the file in it that is written last.
+
+    Attributes:
+        path: The file.
+        key: What it is made from.
+        moves: It lies in a folder that is replaced as a whole, and takes the marker with it: an old one stays
+            known for what it is until then.
     """
 
     path: Path
     key: str
+    moves: bool = False
 
     @property
     def _marker(self) -> Path:
@@ -75,7 +82,8 @@ class Output:
     def make(self, make: Callable[[], object]) -> None:
         """Call ``make`` unless the file is done."""
         if not self.done:
-            self.forget()
+            if not self.moves:
+                self.forget()
             make()
             self.mark()
 

@@ -222,7 +222,7 @@ class RecordedJob:
         Raises:
             DriveFormatError: If there is no such drive.
         """
-        return Output(self.frames / "map.yaml", map_key(self._request, self.recording.map))
+        return Output(self.frames / "map.yaml", map_key(self._request, self.recording.map), moves=True)
 
     @property
     def _request(self) -> MapRequest:

@@ -110,3 +110,20 @@ def test_settings_and_dataclasses_count_by_their_values():
 
     assert key_of(Edges(sigma=1.5), Window(0.5)) == key_of({"sigma": 1.5}, {"cell_cm": 0.5})
     assert key_of(Edges(sigma=1.5)) != key_of(Edges(sigma=2.0))
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_what_is_replaced_as_a_whole_stays_known_while_another_is_made(tmp_path, moves):
+    path = tmp_path / "map.yaml"
+    path.write_text("of 31 cm")
+    old, new = Output(path, "31 cm", moves), Output(path, "37 cm", moves)
+    old.mark()
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        new.make(interrupted)
+    assert old.done == moves and not new.done
+    new.make(lambda: path.write_text("of 37 cm"))
+    assert new.done and not old.done
