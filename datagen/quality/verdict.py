@@ -66,6 +66,7 @@ class MapEvidence:
         withheld: Sections of the lines that are withheld because the images contradict them, in words.
         withheld_share: Share of the lines' length in these sections.
         segments: Number of segments of the map.
+        gaps: How often the recording pauses.
     """
 
     lines: dict[str, LineEvidence]
@@ -96,6 +97,7 @@ class MapEvidence:
     withheld: tuple[str, ...] = ()
     withheld_share: float = 0.0
     segments: int = 1
+    gaps: int = 0
 
 
 Grade = Literal["good", "usable", "reject"]
@@ -228,6 +230,13 @@ _DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
 _USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
 
 
+#: So many pauses of a recording are those of a throttle that is let go again and again, and not of one or two
+#: stops. Chosen.
+_MANY_GAPS = 10
+_RECORD_WHOLE = (
+    "the recording has {} pauses, as where it runs only while the throttle is pressed, and what lies in them "
+    "is not seen; record all of the drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)"
+)
 #: Share of frames that is worth naming.
 _TOLD = 0.02
 
@@ -308,6 +317,9 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
             "before a network drives, exchange STEERING_LEFT_PWM and STEERING_RIGHT_PWM in the car's "
             "myconfig.py, or undo the camera's mirroring (CAMERA_HFLIP)"
         )
+    # Where too few frames have labels, that is the remedy.
+    if e.gaps >= _MANY_GAPS and e.labelled_share >= s.min_labelled:
+        yield _RECORD_WHOLE.format(e.gaps)
     if e.bend_lane_cm is not None:
         width_cm = e.given_lane_cm if e.found_lane_cm is None else e.found_lane_cm
         yield (
@@ -459,7 +471,9 @@ def _labelled(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             grade,
             f"only {_percent(e.labelled_share)} of the frames have labels (most of the others: {most})",
-            f"look at the strip of frames in the report, and {_DRIVE_AGAIN}",
+            _RECORD_WHOLE.format(e.gaps)
+            if e.gaps >= _MANY_GAPS
+            else f"look at the strip of frames in the report, and {_DRIVE_AGAIN}",
             f"{_percent(e.labelled_share)} of the frames {expected} ({causes}), rejected below "
             f"{_percent(1.0 - s.usable * (1.0 - s.min_labelled))} (min_labelled)",
         )

@@ -113,6 +113,12 @@ def commanded_motion(
     return CommandedMotion(distance, speed_cm_s is not None, turn, periods)
 
 
+def count_gaps(drive: Drive) -> int:
+    """Return how often a recording pauses: steps between frames that are longer than the typical one."""
+    step_s = np.diff(drive.driven_s)
+    return int(np.count_nonzero(step_s > GAP_PERIODS * np.median(step_s))) if len(step_s) else 0
+
+
 def _fill_gaps(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Carry the last known command over rows that lack one; zero before the first."""
     known = np.isfinite(values)

@@ -54,6 +54,17 @@ def test_sections_that_are_withheld_are_said_first():
     assert graded(GOOD, withheld=withheld, withheld_share=0.9).grade == "reject"
 
 
+def test_pauses_of_the_recording_are_named_once():
+    paused = graded(GOOD, gaps=82)
+    assert paused.grade == "good" and [text for text in paused.remarks if "82 pauses" in text]
+    few = graded(GOOD, gaps=82, labelled_share=0.73)
+    assert few.grade == "usable" and "82 pauses" in few.sentence and "AUTO_RECORD_ON_THROTTLE" in few.sentence
+    assert not [text for text in few.remarks if "pauses" in text]
+    # One stop or two are none of a throttle.
+    assert "strip of frames" in graded(GOOD, gaps=2, labelled_share=0.73).sentence
+    assert not [text for text in graded(GOOD, gaps=2).remarks if "pauses" in text]
+
+
 def test_a_camera_that_does_not_see_what_is_labelled_is_named():
     verdict = graded(GOOD, in_view=0.04, ahead_cm=27.5)
     assert verdict.grade == "usable"

@@ -11,7 +11,7 @@ from pixel_road import fisheye
 
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
-from datagen.slam.commands import BREAK_PERIODS, commands_of
+from datagen.slam.commands import BREAK_PERIODS, commands_of, count_gaps
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.loops.parts import connected, placing_revisits
 from datagen.slam.loops.pose_graph import close_loops, loop_pairs
@@ -155,3 +155,12 @@ def test_pairs_beside_a_revisit_keep_to_their_parts():
     pairs = loop_pairs([Revisit(48, 90, np.zeros(3), 0.8), Revisit(10, 52, np.zeros(3), 0.8)], part)
     assert (44, 86) in pairs and (52, 94) not in pairs
     assert (14, 56) in pairs and (6, 48) not in pairs
+
+
+def test_pauses_of_a_recording_are_counted():
+    image = np.zeros((12, 16, 3), np.uint8)
+    whole = made_up_drive([image] * 40)
+    assert count_gaps(whole) == 0
+    pulses = np.arange(40) + np.repeat([0, 4, 11, 12], 10)
+    assert count_gaps(replace(whole, t_s=0.05 * pulses)) == 3
+    assert count_gaps(made_up_drive([image])) == 0
