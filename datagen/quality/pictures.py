@@ -19,6 +19,7 @@ from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
 from lanenet.page import Picture
+from lanenet.perception.draw import outlined_text
 
 #: Colours, BGR.
 _LEFT, _RIGHT, _ADJACENT, _POINT = (80, 220, 80), (220, 80, 220), (200, 200, 80), (60, 60, 255)
@@ -166,8 +167,7 @@ def draw_lines(
     for u, v in pixels(np.stack([lines.points_cm, rows], axis=1)):
         if np.isfinite(u) and np.isfinite(v) and abs(u) < 9999 and abs(v) < 9999:
             cv2.circle(big, (round(u), round(v)), 5, _POINT, 1, cv2.LINE_AA)
-    cv2.putText(big, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 2, cv2.LINE_AA)
-    cv2.putText(big, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
+    outlined_text(big, text, (6, 18), 0.55, (0, 0, 0), (255, 255, 255))
     return np.asarray(big)
 
 

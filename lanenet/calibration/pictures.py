@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 
 from lanenet.calibration.lens import moved_points
 from lanenet.geometry.camera import Camera
+from lanenet.perception.draw import outlined_text
 from lanenet.perception.edges.views import View
 
 #: BGR of the grid's lines, of its axes, of measured and of projected points.
@@ -93,5 +94,4 @@ def _draw_grid(
 
 
 def _write(image: UInt8[np.ndarray, "rows columns 3"], text: str, place: tuple[int, int]) -> None:
-    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, thickness, cv2.LINE_AA)
+    outlined_text(image, text, place, 0.4, (255, 255, 255), (0, 0, 0))

@@ -199,5 +199,31 @@ def _draw_arrow(image: UInt8[np.ndarray, "h w 3"], steering_rad: float, thicknes
 def _draw_text(image: UInt8[np.ndarray, "h w 3"], text: str, thickness: int) -> None:
     size = image.shape[1] / 800.0
     origin = (round(12 * size), round(30 * size))
-    for colour, width in (((0, 0, 0), 3 * thickness), (TEXT_BGR, thickness)):
-        cv2.putText(image, text, origin, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)
+    outlined_text(image, text, origin, size, TEXT_BGR, (0, 0, 0), thickness)
+
+
+def outlined_text(
+    image: UInt8[np.ndarray, "h w 3"],
+    text: str,
+    origin: tuple[int, int],
+    size: float,
+    colour: tuple[int, int, int],
+    outline: tuple[int, int, int],
+    thickness: int = 1,
+) -> None:
+    """Write a text that is readable on any ground.
+
+    Args:
+        image: Is written on.
+        text: The text.
+        origin: Of its lower left corner, [px].
+        size: OpenCV's scale.
+        colour: BGR.
+        outline: BGR, of a rim as wide as the strokes.
+        thickness: Of the strokes, [px].
+    """
+    u, v = origin
+    # In OpenCV 5 thicker letters are wider, and would run out of step with thinner ones on them.
+    rim = [(u + du, v + dv) for du in (-thickness, 0, thickness) for dv in (-thickness, 0, thickness)]
+    for at, shade in (*((at, outline) for at in rim), (origin, colour)):
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, shade, thickness, cv2.LINE_AA)
