@@ -6,6 +6,7 @@ Imports ``datagen`` and ``lanenet.learn`` inside the commands, since the car has
 from __future__ import annotations
 
 import functools
+import re
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,6 +53,9 @@ if TYPE_CHECKING:
     from lanenet.evaluation.robustness import RobustRow
     from lanenet.evaluation.sources import Opened
 
+#: Names of networks, which are those of folders.
+_NAME = "[A-Za-z0-9][A-Za-z0-9._-]*"
+
 app = typer.Typer()
 
 
@@ -72,7 +76,7 @@ def run_settings_schema() -> type[Settings]:
             checkpoints_dir: Parent of the checkpoint's folder.
         """
 
-        name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+        name: str = Field(pattern=f"^{_NAME}$")
         data: DataSettings = Field(default_factory=DataSettings)
         learn: LearnSettings = Field(default_factory=LearnSettings)
         work_dir: Path | None = None
@@ -150,6 +154,8 @@ def train(
         )
     if name is None:
         raise ConfigError(f"expected a name for the network, as in --name {paths[0].resolve().stem}")
+    if not re.fullmatch(_NAME, name):
+        raise ConfigError(f"--name {name!r}: expected letters, digits, '.', '_' and '-', the first no sign")
     plain = own_config(name, paths, measured, overrides, Path("runs"))
     settings = check_settings(run_settings_schema(), plain, shlex.join(["lanenet", "train", *sources]))
     check_taken(settings, force)

@@ -72,10 +72,11 @@ def open_source(
     Raises:
         LanenetError: If it is none of these, or cannot be read.
     """
+    from lanenet.data.drives import meant_instead
     from lanenet.data.label_set import read_labels
 
     if not path.exists():
-        raise DriveFormatError(f"{path}: no such model or source")
+        raise DriveFormatError(f"{path}: no such model or source{meant_instead(path)}")
     if path.is_file():
         return Opened(path, labels=read_labels(path))
     _check_folder(path)

@@ -236,7 +236,10 @@ class LaneMemory:
         seen_cm = self._widths_cm.median
         if abs(seen_cm / self.given_cm - 1.0) < _WRONG:
             return ""
-        return f"lane width {self.given_cm:g} cm: the lines that are seen lie {seen_cm:.0f} cm apart"
+        return (
+            f"lane width {self.given_cm:g} cm: the lines that are seen lie {seen_cm:.0f} cm apart; measure "
+            "the lane on a straight, between the middles of its two lines"
+        )
 
     def match(self, widths_cm: Float[np.ndarray, "*shape"], sigma: float) -> Float[np.ndarray, "*shape"]:
         """Rate widths from 0 to 1, the likeliest; ``sigma`` is that of the logarithm along the lane."""

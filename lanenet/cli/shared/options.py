@@ -210,8 +210,7 @@ def check_not_source(source: Path, *outs: Path | None) -> None:
 
 def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:
     # Imported here: commands that read no drive need not wait for OpenCV.
-    from lanenet.data.drives import FORMATS, find_format
-    from lanenet.data.drives.sources import PHOTO_ENDINGS
+    from lanenet.data.drives import FORMATS, PHOTO_ENDINGS, find_format
     from lanenet.data.tables import is_answers
 
     if not resolved.is_dir():

@@ -20,6 +20,7 @@ from lanenet.reading import is_folder
 
 __all__ = [
     "FORMATS",
+    "PHOTO_ENDINGS",
     "Commands",
     "Drive",
     "drive_above",
@@ -34,6 +35,8 @@ __all__ = [
 #: Folders deep in which drives are looked for, and how many are named. Chosen: a Donkeycar's folder holds its
 #: tubs as ``data/tub_1``.
 _HINT_DEPTH, _HINT_COUNT = 2, 3
+#: Endings of photos: what OpenCV reads.
+PHOTO_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm")
 #: Tried in this order; a folder that is both a drive folder and a tub is read as the former.
 FORMATS: tuple[DriveFormat, ...] = (folder.FORMAT, tub.FORMAT, video.FORMAT, bag.FORMAT)
 
@@ -71,7 +74,7 @@ def meant_instead(path: Path) -> str:
         return f"; the drive is the folder above it: type {shlex.quote(str(above))}"
     inside = list(itertools.islice(drives_in(path, _HINT_DEPTH), _HINT_COUNT + 1))
     if not inside:
-        return ""
+        return _photos_instead(path)
     names = ", ".join(shlex.quote(str(each)) for each in inside[:_HINT_COUNT])
     more = " or another" if len(inside) > _HINT_COUNT else ""
     return f"; {'there is a drive' if len(inside) == 1 else 'there are drives'} in it: type {names}{more}"
@@ -84,6 +87,19 @@ def _spelt_instead(path: Path) -> str:
         return ""
     alike = difflib.get_close_matches(path.name, beside, n=1)
     return f"; did you mean {shlex.quote(str(path.with_name(alike[0])))}?" if alike else ""
+
+
+def _photos_instead(path: Path) -> str:
+    """Say of a folder of images that they are no drive."""
+    if not is_folder(path):
+        return ""
+    photos = sum(1 for entry in path.iterdir() if entry.suffix.lower() in PHOTO_ENDINGS)
+    if not photos:
+        return ""
+    return (
+        f"; it holds {photos} images without a frames.csv: single photos cannot be mapped, and lanenet "
+        "detect takes each of them"
+    )
 
 
 def drive_above(path: Path) -> Path | None:

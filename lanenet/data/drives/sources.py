@@ -12,13 +12,19 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lanenet.data.drives import drive_above, find_format, formats_text, meant_instead, open_drive
+from lanenet.data.drives import (
+    PHOTO_ENDINGS,
+    drive_above,
+    find_format,
+    formats_text,
+    meant_instead,
+    open_drive,
+)
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.static import find_static, spread_frames
 from lanenet.reading import read_image
 
-PHOTO_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm")
 #: Photos have no times; an annotated video shows one per second.
 PHOTO_RATE_HZ = 1.0
 #: Rate of a drive with a single frame: Donkeycar's default.

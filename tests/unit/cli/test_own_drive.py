@@ -33,6 +33,7 @@ from lanenet.cli.shared.own_drive import (
 from lanenet.cli.shared.stages import Stages, stopped_in
 from lanenet.cli.train import expected_s, gain_line, run_settings_schema
 from lanenet.config import apply_overrides, check_settings
+from lanenet.data.drives import open_drive
 from lanenet.data.label_set import write_labels
 from lanenet.data.maps.folder import write_map
 from lanenet.errors import ConfigError, DriveFormatError, LanenetError
@@ -207,6 +208,14 @@ def test_words_are_sources_or_settings(here: Path) -> None:
     assert parts_of(["tub", "a=b", "learn.epochs=3"]) == ([Path("tub"), Path("a=b")], ["learn.epochs=3"])
 
 
+def test_photos_are_no_drive_and_that_is_said(here: Path) -> None:
+    (here / "photos").mkdir()
+    for name in ("a.jpg", "b.PNG", "notes.txt"):
+        (here / "photos" / name).write_bytes(b"")
+    with pytest.raises(DriveFormatError, match=r"it holds 2 images without a frames\.csv"):
+        open_drive(here / "photos")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -215,7 +224,7 @@ def test_words_are_sources_or_settings(here: Path) -> None:
         (["mine.yaml", "--name", "a"], "--name: is for drives, but mine.yaml is a config"),
         (["mine.yaml", "--frames", "1:3"], "--frames: is for drives, but mine.yaml is a config"),
         (["drive", "--lane-width", "40", "--name", "a", "learn.epochz=3"], "unknown key 'learn.epochz'"),
-        (["drive", "--lane-width", "40", "--name", "../a"], "key 'name'"),
+        (["drive", "--lane-width", "40", "--name", "../a"], "--name '../a': expected letters"),
         (["none", "--lane-width", "40", "--name", "a"], "none: no such drive"),
         (["drive", "--lane-width", "40", "--name", "a", "learn.start_from=b"], "b: no such folder"),
     ],
