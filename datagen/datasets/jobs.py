@@ -17,6 +17,7 @@ from datagen.datasets.splits import in_window, split_recording
 from datagen.labels.truth import truth_labels
 from datagen.made import Output, fingerprint, key_of
 from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive, map_key
+from datagen.prepare import check_count
 from datagen.slam.segment import StageProgress
 from datagen.world.simulate import simulate_drive
 from datagen.world.variety import first_world, vary_simulation
@@ -255,6 +256,16 @@ class RecordedJob:
         if self.is_labels:
             return len(read_labels(self.recording.path))
         return len(read_map(self.frames).frames) if self.is_map else len(self._request.open_drive())
+
+    def check_long_enough(self) -> None:
+        """Refuse a drive that is too short to be mapped, before others are mapped for minutes.
+
+        Raises:
+            TrackingLostError: Names the number of frames.
+            LanenetError: If the drive cannot be read.
+        """
+        if not self.is_mapped:
+            check_count(self._request.open_drive())
 
     def make_map(self, progress: StageProgress | None = None) -> None:
         """Map the drive, unless it has been mapped before.

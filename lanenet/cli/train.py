@@ -242,6 +242,8 @@ class _Run:
         """Do all stages; returns the checkpoint's folder."""
         begin = self._stages.begin
         self._check_leaks()
+        for job in self.jobs:
+            job.check_long_enough()
         if self.jobs:
             with begin("map"):
                 for job in self.jobs:

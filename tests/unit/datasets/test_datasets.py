@@ -346,3 +346,15 @@ def test_a_recording_is_listed_once(tmp_path):
     again = RecordedSettings(path=tmp_path / "maps" / ".." / "tub", lane_width_cm=30.0)
     with pytest.raises(ValueError, match=r"tub is listed twice.*counts_as"):
         DataSettings(drives=(drive, again))
+
+
+@pytest.mark.parametrize(("frames", "enough"), [(59, False), (60, True)])
+def test_a_drive_that_is_too_short_is_refused_before_any_is_mapped(tmp_path, frames, enough):
+    drive = write_recording(tmp_path / "drive", lap(frames=frames))
+    recorded = RecordedSettings(path=drive, lane_width_cm=40.0)
+    job = RecordedJob(recorded, DataSettings(), tmp_path / "work")
+    if enough:
+        job.check_long_enough()
+        return
+    with pytest.raises(TrackingLostError, match="found 59 frames of a car that drives, expected 60"):
+        job.check_long_enough()
