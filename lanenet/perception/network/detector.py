@@ -28,7 +28,7 @@ from lanenet.perception.network.compact.network import ANSWERS, open_network
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta
 from lanenet.perception.network.tracking.camera_view import CameraView
 from lanenet.perception.network.tracking.lane_belief import Keep
-from lanenet.perception.network.tracking.tracker import Answer, LaneTracker
+from lanenet.perception.network.tracking.tracker import LaneTracker
 
 log = logging.getLogger(__name__)
 
@@ -132,11 +132,8 @@ class NetworkDetector:
         ):
             self._tracker.lose()
             return LaneEstimate()
-        points_cm, sigma_cm, presence = self._run(self.memory.width_cm)
-        without_width = self._run(None) if self._doubts_width() else None
-        points_cm, sigma_cm, seen_cm = self._tracker.follow(
-            points_cm, sigma_cm, presence, edges, without_width
-        )
+        points_cm, sigma_cm, presence = self._run()
+        points_cm, sigma_cm, seen_cm = self._tracker.follow(points_cm, sigma_cm, presence, edges)
         if not self._told and (contradiction := self.memory.contradiction):
             self._told = True
             self.problems.append(contradiction)
@@ -160,20 +157,15 @@ class NetworkDetector:
         self._raster[:] = raster[: len(self._raster)]
         if not np.count_nonzero(self._raster[0]):
             return LaneEstimate()
-        points_cm, sigma_cm, presence = self._run(self.memory.width_cm)
+        points_cm, sigma_cm, presence = self._run()
         points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
         self.memory.learn(points_cm, presence)
         return self._estimate(points_cm, sigma_cm, presence, presence)
 
-    def _doubts_width(self) -> bool:
-        """Return whether the network has been told a width that was learned, and a line is not seen by it."""
-        learned = self.memory.given_cm is None and self.memory.width_cm is not None
-        return self.meta.takes_width and learned and self._tracker.lacks_a_line
-
-    def _run(self, width_cm: float | None) -> Answer:
-        """Run the network on the raster, with the lane's width if it is known."""
+    def _run(self) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
+        """Run the network on the raster, with the lane's width as soon as it is known."""
         if self.meta.takes_width:
-            self._feed[WIDTH_NAME] = np.array([width_cm or 0.0], np.float32)
+            self._feed[WIDTH_NAME] = np.array([self.memory.width_cm or 0.0], np.float32)
         found = self._session.run(ANSWERS, self._feed)
         points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
         return points_cm, sigma_cm, presence

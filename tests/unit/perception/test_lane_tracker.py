@@ -112,50 +112,6 @@ def test_one_line_that_is_seen_tells_where_the_other_one_is():
     assert seen_cm[1] == 0.0 and 2.0 < sigma_cm[3:].max() < 3.0
 
 
-@pytest.mark.parametrize("sees", ["both", "one", "both, but says so of one"])
-def test_a_pair_that_is_seen_speaks_against_a_width_that_was_learned_wrong(sees):
-    """A stripe in the lane was taken for its left line; now only the lane's own two lines are there."""
-    memory, wide = LaneMemory(), np.repeat([-30.0, 30.0], 3)
-    stripe = np.repeat([10.0, 30.0], 3)
-    for _ in range(20):
-        memory.learn(stripe, np.ones(2))
-    tracker = LaneTracker(memory)
-    assert tracker.lacks_a_line and memory.width_cm == pytest.approx(20.0, rel=0.05)
-    edges = edges_of(wide, sides=(1,) if sees == "one" else (0, 1))
-    present = np.array([0.3, 1.0]) if sees == "both, but says so of one" else SEEN
-    for _ in range(3):
-        told_cm, _, _ = tracker.follow(stripe, SURE, SEEN, edges)
-        np.testing.assert_allclose(told_cm, stripe, atol=0.5)
-        assert tracker.lacks_a_line
-    answers = []
-    for _ in range(40):
-        # A network that is told a width answers accordingly.
-        told = wide if (memory.width_cm or 0.0) > 40.0 else stripe
-        answers.append(tracker.follow(told, SURE, SEEN, edges, (wide, SURE, present))[0])
-    if sees == "both":
-        # Not at once: both pairs have something for them.
-        assert not any((answer[:3] > 0.0).any() for answer in answers)
-        np.testing.assert_allclose(answers[-1], wide, atol=0.2)
-        assert memory.width_cm == pytest.approx(60.0, rel=0.05) and not tracker.lacks_a_line
-        tracker.reset()
-    else:
-        np.testing.assert_allclose(answers[-1], stripe, atol=0.5)
-    assert tracker.lacks_a_line
-
-
-@pytest.mark.parametrize(("seen_cm", "chosen"), [(10.0, False), (30.0, True)])
-def test_a_short_line_does_not_speak_against_a_width_that_was_learned(seen_cm, chosen):
-    memory, usual, wider = LaneMemory(), np.repeat([-20.0, 30.0], 3), np.repeat([-30.0, 30.0], 3)
-    for _ in range(40):
-        memory.learn(usual, np.ones(2))
-    tracker = LaneTracker(memory)
-    whole = edges_of(wider)
-    shown = (whole.points_cm[:, 0] > 0.0) | (whole.points_cm[:, 1] < 2.0 + seen_cm)
-    edges = RoadEdges(whole.points_cm[shown], whole.normals[shown])
-    tracker.follow(usual, SURE, SEEN, edges, (wider, SURE, SEEN))
-    assert (tracker._last[0][0][1] < -25.0) == chosen
-
-
 @pytest.mark.parametrize("forgotten", [False, True])
 def test_the_line_beside_a_lane_that_has_widened_is_not_told_by_its_usual_width(forgotten):
     tracker = LaneTracker(LaneMemory(LANE_CM))

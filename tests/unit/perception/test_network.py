@@ -371,37 +371,6 @@ def test_a_network_that_takes_the_width_gets_it(width_model_path, monkeypatch):
     assert not np.allclose(answers[0], answers[1]) and not np.allclose(answers[1], answers[2])
 
 
-@pytest.mark.parametrize(
-    ("given", "learned", "lacks", "asked"),
-    [
-        (None, True, True, [40.0, 0.0]),
-        (None, True, False, [40.0]),
-        (None, False, True, [0.0]),
-        (40.0, True, True, [40.0]),
-    ],
-)
-def test_a_width_that_was_learned_is_withheld_where_a_line_is_not_seen(
-    width_model_path, monkeypatch, given, learned, lacks, asked
-):
-    detector = NetworkDetector(width_model_path, CAMERA, lane_width_cm=given)
-    for _ in range(20 if learned else 0):
-        detector.memory.learn(LANE, np.ones(2))
-    detector._tracker.lacks_a_line = lacks
-    widths = []
-
-    class Session:
-        def run(self, names, inputs):
-            widths.append(float(inputs["lane_width_cm"][0]))
-            return [np.array([v], np.float32) for v in (LANE, np.full(6, 0.5), [1.0, 1.0])]
-
-    monkeypatch.setattr(detector, "_session", Session())
-    detector.detect(striped_frame())
-    assert widths == pytest.approx(asked, abs=0.5)
-    # This frame shows both lines, so that the next one asks once.
-    detector.detect(striped_frame())
-    assert len(widths) == len(asked) + 1
-
-
 def test_no_damaged_byte_of_a_model_goes_unnoticed(model_path, tmp_path):
     data, rng = model_path.read_bytes(), np.random.default_rng(0)
     for at in [*rng.integers(0, len(data), 200).tolist(), 0, len(data) - 1, len(data) - 40]:

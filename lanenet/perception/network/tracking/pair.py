@@ -41,7 +41,7 @@ _NARROWEST = 0.3
 #: network sees, too: the rim of a reflection that is found again in each frame tells none. On 120 simulated
 #: drives without a given width the RMSE is 2.54 instead of 3.60 cm for it. Tried: 9, 15 and 21 cm gave 2.58,
 #: 2.55 and 2.28 cm, and 94.8, 94.1 and 92.9 % of the points are answered.
-TELLS_WIDTH_CM = 15.0
+_TELLS_WIDTH_CM = 15.0
 _MIDDLE = 1
 _CERTAIN = np.ones(len(SIDES))
 
@@ -146,7 +146,7 @@ def tells_width(lines: Pair) -> bool:
     """Return whether both lines tell the lane's width: they are seen, and the car is between them."""
     left, right = lines
     between = left.points_cm[0] <= 0.0 <= right.points_cm[0]
-    return between and all(line.seen_cm >= TELLS_WIDTH_CM and line.presence > SEEN for line in lines)
+    return between and all(line.seen_cm >= _TELLS_WIDTH_CM and line.presence > SEEN for line in lines)
 
 
 def _middle_cm(lines: Pair) -> float:

@@ -26,7 +26,7 @@ from lanenet.perception.network.tracking.lane_beyond import lane_beyond
 from lanenet.perception.network.tracking.lane_corner import CornerAhead, find_corner
 from lanenet.perception.network.tracking.line_beside import SeenLine, WidthHere, line_beside
 from lanenet.perception.network.tracking.marking_widths import MarkingWidths
-from lanenet.perception.network.tracking.pair import TELLS_WIDTH_CM, Candidate, Pair, best_pair, tells_width
+from lanenet.perception.network.tracking.pair import Candidate, Pair, best_pair, tells_width
 from lanenet.perception.network.tracking.side_road import SideRoadAhead, find_side_road
 from lanenet.perception.network.tracking.straight_on import SeenLines, StraightOn, turns_away_cm
 from lanenet.perception.network.tracking.which_lane import WhichLane
@@ -101,8 +101,7 @@ class _Start(NamedTuple):
 
     A line is known as the left one, 0, or the right one, 1, if it should look like that; as None it may have
     any look. The presence is the network's, of the lines that it sees itself. One that is measured shows how
-    wide its marking is, and what was learned of that has no say. Those without a width are the network's
-    where it was not told how wide the lane is: they count together or not at all.
+    wide its marking is, and what was learned of that has no say.
     """
 
     side: int
@@ -113,7 +112,6 @@ class _Start(NamedTuple):
     presence: float = 0.0
     beyond: bool = False
     measured: bool = False
-    without_width: bool = False
 
 
 class _Found(NamedTuple):
@@ -135,8 +133,6 @@ class _Found(NamedTuple):
 
 #: Points, or sigmas, of the left and of the right line.
 _Both = list[list[float]]
-#: What a network says: points and sigmas, [cm], frame car, and the presence of both lines.
-Answer = tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]
 
 
 class LaneTracker:
@@ -145,7 +141,6 @@ class LaneTracker:
     Attributes:
         lane: The lane's width, given or remembered.
         looks: What its lines look like, and whether it is the lane to drive in.
-        lacks_a_line: Whether the last frame did not show both of its lines.
     """
 
     def __init__(self, lane: LaneMemory, keep: Keep | None = None, view: CameraView | None = None) -> None:
@@ -154,7 +149,6 @@ class LaneTracker:
         self._last: tuple[_Both, _Both] | None = None
         self._rival: Pair | None = None
         self._which_lane = WhichLane()
-        self.lacks_a_line = True
         self.straight_on = StraightOn()
         self.corner = CornerAhead()
         self.side_road = SideRoadAhead()
@@ -167,7 +161,6 @@ class LaneTracker:
     def reset(self) -> None:
         """Forget what earlier frames showed."""
         self._last = self._rival = None
-        self.lacks_a_line = True
         self._which_lane.reset()
         self.straight_on.reset()
         self.corner.reset()
@@ -183,7 +176,6 @@ class LaneTracker:
         sigma_cm: Float[np.ndarray, "6"],
         presence: Float[np.ndarray, "2"],
         edges: RoadEdges,
-        without_width: Answer | None = None,
     ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
         """Return the lane of a frame.
 
@@ -192,8 +184,6 @@ class LaneTracker:
             sigma_cm: Its sigmas.
             presence: Probability that each line can be seen.
             edges: The frame's edge points.
-            without_width: What the network says if it is not told the lane's width, where that was learned:
-                lines that both show themselves speak against a width that is wrong.
 
         Returns:
             Points and sigmas, NaN where the place is unknown, and the length along the road in which each
@@ -203,10 +193,9 @@ class LaneTracker:
         if self._at_corner(borders):
             return self._around_corner()
         network_cm = points_cm.tolist()
-        own, present = (_both(network_cm), _sure_to(sigma_cm)), presence.tolist()
+        own = _both(network_cm), _both([_NETWORK_SIGMA * each_cm for each_cm in sigma_cm.tolist()])
+        present = presence.tolist()
         starts, measured = self._starts(own, present), self._to_measure(own, present)
-        if without_width is not None:
-            starts += _seen_without_width(*without_width)
         # In one go, since each look at the edge points has a price.
         found = self._refine([*starts, *measured], borders)
         looked_for, measures = found[: len(starts)], found[len(starts) :]
@@ -214,7 +203,6 @@ class LaneTracker:
         beside_cm = math.inf if self._last is None else self._nearest_line()[1]
         pair, across_cm, self._rival = best_pair(*candidates, self.lane, beside_cm)
         decided = self._rival is None
-        self.lacks_a_line = min(line.seen_cm for line in pair) < _WIDTH_SEEN_CM
         if self._at_junction(pair, present, borders):
             continued_cm, continued_sigma_cm = (x.ravel().tolist() for x in self.straight_on.lane())
             self._last = _both(continued_cm), _both(continued_sigma_cm)
@@ -370,12 +358,8 @@ class LaneTracker:
     ) -> tuple[list[Candidate], list[Candidate]]:
         """Rate what the left and the right line may be; the last of each is the network's, as it is."""
         candidates: tuple[list[Candidate], list[Candidate]] = ([], [])
-        both = list(zip(starts, found, strict=True))
-        both_seen = all(line.seen_cm >= TELLS_WIDTH_CM for start, line in both if start.without_width)
-        for start, line in both:
+        for start, line in zip(starts, found, strict=True):
             if start.beyond and line.seen_cm < _BEYOND_SEEN_CM:
-                continue
-            if start.without_width and not both_seen:
                 continue
             score_cm = start.score_cm
             score_cm = line.seen_cm + score_cm if line.seen_cm > 0.0 else min(score_cm, _BY_CONTINUING_CM)
@@ -634,25 +618,6 @@ class LaneTracker:
 
 def _both(values: list[float]) -> _Both:
     return [values[: len(ROWS_CM)], values[len(ROWS_CM) :]]
-
-
-def _sure_to(sigma_cm: Float[np.ndarray, "6"]) -> _Both:
-    """Return up to where a network's lines are looked for, by its own sigmas."""
-    return _both([_NETWORK_SIGMA * each_cm for each_cm in sigma_cm.tolist()])
-
-
-def _seen_without_width(
-    points_cm: Float[np.ndarray, "6"], sigma_cm: Float[np.ndarray, "6"], presence: Float[np.ndarray, "2"]
-) -> list[_Start]:
-    """Return both lines of a network that was not told the lane's width, if it sees both."""
-    present = presence.tolist()
-    if min(present) < SEEN:
-        return []
-    lines = zip(range(len(SIDES)), _both(points_cm.tolist()), _sure_to(sigma_cm), present, strict=True)
-    return [
-        _Start(side, x, sigma, _BY_PRESENCE_CM * p, None, p, without_width=True)
-        for side, x, sigma, p in lines
-    ]
 
 
 def _moved(sigma_cm: list[float]) -> list[float]:
