@@ -19,7 +19,6 @@ from datagen.quality.measure import VERDICT_REACH_CM, MapQuality, measure_map, q
 from datagen.quality.places import withheld_figures, withhold_wrong_places
 from datagen.quality.residuals import contradicted_lines, summarise
 from datagen.quality.verdict import Verdict, judge
-from datagen.slam.commands import count_gaps
 from lanenet.data.drives import Drive
 from lanenet.data.maps.mapped_drive import MappedDrive, points_text
 from lanenet.errors import TrackingLostError
@@ -79,7 +78,7 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     figures["withheld"] = withheld_figures(drive_map, list(quality.wrong))
     figures["lane_width"] = asdict(assembled.lane)
     figures["steering_correlation"] = steering_correlation(mapped)
-    figures["gaps"] = count_gaps(drive)
+    figures["pauses"] = prepared.pauses
     request = prepared.request
     figures["given"] = {
         "camera_height_cm": request.camera_height_cm,

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from datagen.quality.measure import held_out_frames
 from datagen.settings import MapSettings, with_wheelbase
+from datagen.slam.commands import habitual_pauses
 from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Commands, Drive, open_drive
@@ -88,6 +89,7 @@ class PreparedDrive:
         settings: Settings, with the drive's wheelbase and without the rows in which the car sees itself.
         camera: The camera, where it is known.
         notes: What was left out or assumed, a sentence each.
+        pauses: How often the recording pauses, if it does so again and again.
     """
 
     request: MapRequest
@@ -96,6 +98,7 @@ class PreparedDrive:
     settings: MapSettings
     camera: Camera | None
     notes: tuple[str, ...]
+    pauses: int = 0
 
     @property
     def known_lane_cm(self) -> float | None:
@@ -112,7 +115,8 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
             if the images are those of a full-circle fisheye, and the camera is not known.
         DriveFormatError: If the recording cannot be read.
     """
-    recorded, unreadable = readable_frames(keep_images(request.open_drive()))
+    opened = keep_images(request.open_drive())
+    recorded, unreadable = readable_frames(opened)
     check_count(recorded)
     check_moving(recorded)
     notes = [*recorded.problems, *unreadable, *_command_notes(recorded)]
@@ -136,7 +140,8 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
                 f"high, but --camera-height gives {request.camera_height_cm:g} cm: expected one of them"
             )
     notes += [*found, *deleted, *nominal, *hidden]
-    return PreparedDrive(request, drive, held_out, settings, known, tuple(notes))
+    pauses = habitual_pauses(opened)
+    return PreparedDrive(request, drive, held_out, settings, known, tuple(notes), pauses)
 
 
 class KeptImages:

@@ -258,7 +258,9 @@ class RecordedJob:
         return len(read_map(self.frames).frames) if self.is_map else len(self._request.open_drive())
 
     def check_long_enough(self) -> None:
-        """Refuse a drive that is too short to be mapped, before others are mapped for minutes.
+        """Refuse a recording that is too short to be mapped, before others are mapped for minutes.
+
+        Frames in which the car stands are left out later.
 
         Raises:
             TrackingLostError: Names the number of frames.

@@ -222,7 +222,8 @@ def map_evidence(
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
         segments=len(figures["segments_mapped"]),
-        gaps=figures["gaps"],
+        # Reports of earlier versions do not know.
+        pauses=figures.get("pauses", 0),
     )
 
 

@@ -66,7 +66,7 @@ class MapEvidence:
         withheld: Sections of the lines that are withheld because the images contradict them, in words.
         withheld_share: Share of the lines' length in these sections.
         segments: Number of segments of the map.
-        gaps: How often the recording pauses.
+        pauses: How often the recording pauses, if it does so again and again.
     """
 
     lines: dict[str, LineEvidence]
@@ -97,7 +97,7 @@ class MapEvidence:
     withheld: tuple[str, ...] = ()
     withheld_share: float = 0.0
     segments: int = 1
-    gaps: int = 0
+    pauses: int = 0
 
 
 Grade = Literal["good", "usable", "reject"]
@@ -230,12 +230,9 @@ _DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
 _USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
 
 
-#: So many pauses of a recording are those of a throttle that is let go again and again, and not of one or two
-#: stops. Chosen.
-_MANY_GAPS = 10
 _RECORD_WHOLE = (
-    "the recording has {} pauses, as where it runs only while the throttle is pressed, and what lies in them "
-    "is not seen; record all of the drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)"
+    "the recording has {} pauses, as where it runs only while the throttle is pressed, and what lies in "
+    "longer ones is not seen: record all of the drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)"
 )
 #: Share of frames that is worth naming.
 _TOLD = 0.02
@@ -317,9 +314,9 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
             "before a network drives, exchange STEERING_LEFT_PWM and STEERING_RIGHT_PWM in the car's "
             "myconfig.py, or undo the camera's mirroring (CAMERA_HFLIP)"
         )
-    # Where too few frames have labels, that is the remedy.
-    if e.gaps >= _MANY_GAPS and e.labelled_share >= s.min_labelled:
-        yield _RECORD_WHOLE.format(e.gaps)
+    # Where too few frames have labels, that is a remedy.
+    if e.pauses and e.labelled_share >= s.min_labelled:
+        yield _RECORD_WHOLE.format(e.pauses)
     if e.bend_lane_cm is not None:
         width_cm = e.given_lane_cm if e.found_lane_cm is None else e.found_lane_cm
         yield (
@@ -350,7 +347,7 @@ def _compared(e: MapEvidence, s: VerdictSettings) -> str:
     ):
         if given is not None:
             text += f"; a {what} of {given:g} cm was measured, so that it comes out {_off(value / given)}"
-    if e.given_height_cm is None:
+    if e.given_height_cm is None and not any(_measured_otherwise(e, s)):
         text += (
             f". Borders of tape blur, so that this shows a wrong lane width from about "
             f"{_percent(s.tape_mismatch)} on; is it right that the camera is {e.height_cm:.1f} cm high? "
@@ -468,12 +465,11 @@ def _labelled(e: MapEvidence, s: VerdictSettings) -> _Findings:
     if grade != "good":
         causes = ", ".join(f"{count} {reason}" for reason, count in e.not_labelled.items() if count)
         most = next(iter(e.not_labelled), "unknown")
+        paused = f"{_RECORD_WHOLE.format(e.pauses)}; or " if e.pauses else ""
         yield Finding(
             grade,
             f"only {_percent(e.labelled_share)} of the frames have labels (most of the others: {most})",
-            _RECORD_WHOLE.format(e.gaps)
-            if e.gaps >= _MANY_GAPS
-            else f"look at the strip of frames in the report, and {_DRIVE_AGAIN}",
+            f"{paused}look at the strip of frames in the report, and {_DRIVE_AGAIN}",
             f"{_percent(e.labelled_share)} of the frames {expected} ({causes}), rejected below "
             f"{_percent(1.0 - s.usable * (1.0 - s.min_labelled))} (min_labelled)",
         )
@@ -627,8 +623,8 @@ def _lane_width(e: MapEvidence, s: VerdictSettings) -> _Findings:
         )
 
 
-def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
-    """Question a lane width that makes another car or road of this one."""
+def _measured_otherwise(e: MapEvidence, s: VerdictSettings) -> _Findings:
+    """Name the lengths that were measured and come out otherwise."""
     for name, value, given, most in (
         ("height_mismatch", e.height_cm, e.given_height_cm, s.height_mismatch),
         ("tape_mismatch", e.tape_cm, e.given_tape_cm, s.tape_mismatch),
@@ -642,6 +638,11 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
                 f"the {what} is {value:.1f} cm on the map, {given:g} cm was given: expected a difference of "
                 f"{_percent(most)} at most ({name})",
             )
+
+
+def _scale(e: MapEvidence, s: VerdictSettings) -> _Findings:
+    """Question a lane width that makes another car or road of this one."""
+    yield from _measured_otherwise(e, s)
     if e.found_lane_cm is not None:
         return
     if e.open_lane_cm is not None:

@@ -78,6 +78,10 @@ def test_the_installed_command_answers() -> None:
 
 
 def test_a_folder_of_the_clones_name_beside_a_script_does_not_hide_the_package(tmp_path: Path) -> None:
+    # An editable installation of it is a line in a .pth file: tested here if this is one.
+    assert tomllib.loads((REPO / "pyproject.toml").read_text())["tool"]["setuptools"]["package-dir"] == {
+        "": "."
+    }
     (tmp_path / "lanenet").mkdir()
     script = tmp_path / "script.py"
     script.write_text("import lanenet\nprint(lanenet.load.__module__)\n")

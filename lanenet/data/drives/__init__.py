@@ -14,7 +14,7 @@ from pathlib import Path
 from lanenet.data.drives import bag, folder, tub, video
 from lanenet.data.drives.folder import read_truth
 from lanenet.data.drives.recording import Commands, Drive, DriveFormat, assemble_drive
-from lanenet.errors import DriveFormatError
+from lanenet.errors import DriveFormatError, counted
 from lanenet.outputs import restore_output
 from lanenet.reading import is_folder
 
@@ -93,12 +93,15 @@ def _photos_instead(path: Path) -> str:
     """Say of a folder of images that they are no drive."""
     if not is_folder(path):
         return ""
-    photos = sum(1 for entry in path.iterdir() if entry.suffix.lower() in PHOTO_ENDINGS)
+    try:
+        photos = sum(1 for entry in path.iterdir() if entry.suffix.lower() in PHOTO_ENDINGS)
+    except OSError:  # a folder that cannot be read shows none
+        return ""
     if not photos:
         return ""
     return (
-        f"; it holds {photos} images without a frames.csv: single photos cannot be mapped, and lanenet "
-        "detect takes each of them"
+        f"; it holds {counted(photos, 'image')} without a frames.csv: single photos cannot be mapped, and "
+        "lanenet detect takes each of them"
     )
 
 

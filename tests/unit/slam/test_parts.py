@@ -11,7 +11,7 @@ from pixel_road import fisheye
 
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
-from datagen.slam.commands import BREAK_PERIODS, commands_of, count_gaps
+from datagen.slam.commands import BREAK_PERIODS, commands_of, habitual_pauses
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.loops.parts import connected, placing_revisits
 from datagen.slam.loops.pose_graph import close_loops, loop_pairs
@@ -157,10 +157,13 @@ def test_pairs_beside_a_revisit_keep_to_their_parts():
     assert (14, 56) in pairs and (6, 48) not in pairs
 
 
-def test_pauses_of_a_recording_are_counted():
+def test_pauses_of_a_recording_are_counted_where_they_are_a_habit():
     image = np.zeros((12, 16, 3), np.uint8)
-    whole = made_up_drive([image] * 40)
-    assert count_gaps(whole) == 0
-    pulses = np.arange(40) + np.repeat([0, 4, 11, 12], 10)
-    assert count_gaps(replace(whole, t_s=0.05 * pulses)) == 3
-    assert count_gaps(made_up_drive([image])) == 0
+    whole = made_up_drive([image] * 100)
+    assert habitual_pauses(whole) == 0
+    # Three in a hundred frames, two, and ten frames that are missing one by one.
+    for missing, expected in (([4, 7, 3], 3), ([4, 7], 0), ([1] * 10, 0)):
+        steps = np.ones(100)
+        steps[5 : 5 + 9 * len(missing) : 9] += missing
+        assert habitual_pauses(replace(whole, t_s=0.05 * np.cumsum(steps))) == expected
+    assert habitual_pauses(made_up_drive([image])) == 0
