@@ -485,6 +485,8 @@ def test_val_says_what_does_not_go_together(tmp_path: Path, monkeypatch: pytest.
     fake_checkpoint(checkpoint, monkeypatch)
     assert "expected a SOURCE" in error_of(run("val", checkpoint))
     assert "none: no such model or source" in error_of(run("val", tmp_path / "none", labels))
+    misspelt = error_of(run("val", tmp_path / "chekpoint", labels))
+    assert "chekpoint: no such model or source; did you mean" in misspelt and "checkpoint?" in misspelt
     assert "l.parquet is a label set" in error_of(run("val", labels, "--detectors", "hough"))
     assert "expected a model" in error_of(run("val", labels, "--detectors", "network"))
     assert "expected a model" in error_of(run("val", labels, "--no-baselines"))

@@ -208,6 +208,21 @@ def test_words_are_sources_or_settings(here: Path) -> None:
     assert parts_of(["tub", "a=b", "learn.epochs=3"]) == ([Path("tub"), Path("a=b")], ["learn.epochs=3"])
 
 
+def test_a_drive_that_is_too_short_is_named_before_others_are_mapped(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_drive(here / "long", 60)
+    write_drive(here / "short", 3)
+
+    def mapped(*_: object) -> None:
+        raise AssertionError("the first one is mapped")
+
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", mapped)
+    words = ["train", "long", "short", "--lane-width", "40", "--name", "a"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 1 and "short: found 3 frames of a car that drives" in result.stderr
+
+
 def test_photos_are_no_drive_and_that_is_said(here: Path) -> None:
     (here / "photos").mkdir()
     for name in ("a.jpg", "b.PNG", "notes.txt"):

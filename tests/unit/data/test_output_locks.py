@@ -133,6 +133,22 @@ def test_a_folder_in_which_nothing_can_be_made_is_an_error(
         raise AssertionError("it has no lock")
 
 
+def test_a_folder_that_another_run_has_just_removed_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, failed = os.open, []
+
+    def once(path: Path, *more: int) -> int:
+        if Path(path).name.endswith(".lock") and not failed:
+            failed.append(path)
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory", str(path))
+        return whole(path, *more)
+
+    monkeypatch.setattr(os, "open", once)
+    with lock_output(tmp_path / "maps" / "map"):
+        assert failed and (tmp_path / "maps" / ".map.lock").exists()
+
+
 def test_folders_made_for_a_lock_go_again(tmp_path: Path) -> None:
     with lock_output(tmp_path / "deep" / "er" / "out"):
         assert (tmp_path / "deep" / "er").is_dir()

@@ -358,3 +358,23 @@ def test_a_drive_that_is_too_short_is_refused_before_any_is_mapped(tmp_path, fra
         return
     with pytest.raises(TrackingLostError, match="found 59 frames of a car that drives, expected 60"):
         job.check_long_enough()
+
+
+def test_a_map_stays_known_while_one_of_another_width_is_made(tmp_path, monkeypatch):
+    drive = write_recording(tmp_path / "drive", lap(frames=3))
+    narrow, wide = (
+        RecordedJob(RecordedSettings(path=drive, lane_width_cm=cm), DataSettings(), tmp_path / "work")
+        for cm in (31.0, 37.0)
+    )
+    assert narrow.frames == wide.frames
+    narrow.frames.mkdir(parents=True)
+    (narrow.frames / "map.yaml").write_text("a map")
+    narrow.map_output.mark()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        wide.make_map()
+    assert narrow.is_mapped and not wide.is_mapped

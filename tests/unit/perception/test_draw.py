@@ -5,7 +5,7 @@ import pytest
 
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.geometry.lane import ROWS_CM
-from lanenet.perception.draw import ARROW_BGR, LEFT_BGR, RIGHT_BGR, draw_estimate
+from lanenet.perception.draw import ARROW_BGR, LEFT_BGR, RIGHT_BGR, draw_estimate, outlined_text
 from lanenet.perception.estimate import LaneEstimate
 from lanenet.perception.image_lane import ImageLane
 
@@ -93,3 +93,16 @@ def test_positive_steering_points_left() -> None:
         )
         columns = np.nonzero(has_colour(picture, ARROW_BGR))[1]
         assert (columns.mean() < 80.0) == leftwards
+
+
+@pytest.mark.parametrize("ground", [0, 255])
+def test_a_text_has_a_rim_that_sets_it_off_any_ground(ground):
+    image = np.full((40, 200, 3), ground, np.uint8)
+    outlined_text(image, "24.0 cm", (4, 24), 0.55, (255, 255, 255), (0, 0, 0))
+    gray = image[..., 0]
+    letters, rim = gray > 200, gray < 60
+    assert letters.sum() > 50 and rim.sum() > 50
+    if ground == 255:
+        # Letters as bright as the ground are told by a rim on both sides.
+        row = rim[18]
+        assert np.count_nonzero(np.diff(row.astype(int)) == 1) >= 10
