@@ -162,6 +162,6 @@ def test_no_document_has_a_figure_left_open():
     documents = [REPO / "README.md", REPO / "CONTRIBUTING.md", REPO / "checkpoints" / "README.md"]
     for document in [*documents, *(REPO / "docs").glob("*.md")]:
         text = document.read_text(encoding="utf-8")
-        assert not re.search(r"@[A-Z]_|lead fills|TODO", text), document
+        assert not re.search(r"@[A-Z]_|lead fills|TODO|(?m:^[A-Z]{4,}\.?$)", text), document
         for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
             assert (document.parent / picture).is_file(), f"{document}: {picture}"
