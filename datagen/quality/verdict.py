@@ -223,17 +223,14 @@ _LOOP_OR_CAMERA = (
     "(--camera)"
 )
 _DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
-
-
-#: Height of the camera and width of the tape of most cars, [cm]; others are asked about if that would help.
-#: Measured: three recorded drives have 12 to 19 and 1.7 to 4.8 cm; a sixth is left on either side.
-_USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
-
-
 _RECORD_WHOLE = (
     "the recording has {} pauses, as where it runs only while the throttle is pressed, and what lies in "
     "longer ones is not seen: record all of the drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)"
 )
+
+#: Height of the camera and width of the tape of most cars, [cm]; others are asked about if that would help.
+#: Measured: three recorded drives have 12 to 19 and 1.7 to 4.8 cm; a sixth is left on either side.
+_USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
 #: Share of frames that is worth naming.
 _TOLD = 0.02
 
@@ -340,18 +337,15 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
 
 def _compared(e: MapEvidence, s: VerdictSettings) -> str:
     """Say how the lengths that were measured differ from those that follow, and what they cannot show."""
-    text = ""
-    for what, given, value in (
-        ("height", e.given_height_cm, e.height_cm),
-        ("tape", e.given_tape_cm, e.tape_cm),
-    ):
-        if given is not None:
-            text += f"; a {what} of {given:g} cm was measured, so that it comes out {_off(value / given)}"
+    text = "".join(
+        f"; {what}: {given:g} cm was measured, so that it comes out {_off(value / given)}"
+        for what, value, given, _, _ in _measured(e, s)
+    )
     if e.given_height_cm is None and not any(_measured_otherwise(e, s)):
         text += (
             f". Borders of tape blur, so that this shows a wrong lane width from about "
-            f"{_percent(s.tape_mismatch)} on; is it right that the camera is {e.height_cm:.1f} cm high? "
-            f"--camera-height shows {_percent(s.height_mismatch)}"
+            f"{_percent(s.tape_mismatch)} on; is it right that the camera is {e.height_cm:.1f} cm high? Its "
+            f"height, measured (--camera-height), shows one from about {_percent(s.height_mismatch)} on"
         )
     return text
 
@@ -623,20 +617,26 @@ def _lane_width(e: MapEvidence, s: VerdictSettings) -> _Findings:
         )
 
 
+def _measured(e: MapEvidence, s: VerdictSettings) -> Iterator[tuple[str, float, float, float, str]]:
+    """Yield what was measured: its name, its length on the map and as given, its bound, the bound's name."""
+    for what, value, given, most, bound in (
+        ("camera's height", e.height_cm, e.given_height_cm, s.height_mismatch, "height_mismatch"),
+        ("tape's width", e.tape_cm, e.given_tape_cm, s.tape_mismatch, "tape_mismatch"),
+    ):
+        if given is not None:
+            yield what, value, given, most, bound
+
+
 def _measured_otherwise(e: MapEvidence, s: VerdictSettings) -> _Findings:
     """Name the lengths that were measured and come out otherwise."""
-    for name, value, given, most in (
-        ("height_mismatch", e.height_cm, e.given_height_cm, s.height_mismatch),
-        ("tape_mismatch", e.tape_cm, e.given_tape_cm, s.tape_mismatch),
-    ):
-        what = "camera's height" if name == "height_mismatch" else "tape's width"
-        if given is not None and max(value / given, given / value) > 1.0 + most:
+    for what, value, given, most, bound in _measured(e, s):
+        if max(value / given, given / value) > 1.0 + most:
             yield Finding(
                 "usable",
                 f"the {what} comes out as {value:.1f} cm, not {given:g} cm",
                 f"measure the {what}, and the lane between the middles of its two lines",
                 f"the {what} is {value:.1f} cm on the map, {given:g} cm was given: expected a difference of "
-                f"{_percent(most)} at most ({name})",
+                f"{_percent(most)} at most ({bound})",
             )
 
 

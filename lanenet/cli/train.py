@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from lanenet.cli import val as val_cli
 from lanenet.cli.shared import console
@@ -53,9 +53,6 @@ if TYPE_CHECKING:
     from lanenet.evaluation.robustness import RobustRow
     from lanenet.evaluation.sources import Opened
 
-#: Names of networks, which are those of folders.
-_NAME = "[A-Za-z0-9][A-Za-z0-9._-]*"
-
 app = typer.Typer()
 
 
@@ -76,11 +73,19 @@ def run_settings_schema() -> type[Settings]:
             checkpoints_dir: Parent of the checkpoint's folder.
         """
 
-        name: str = Field(pattern=f"^{_NAME}$")
+        name: str
         data: DataSettings = Field(default_factory=DataSettings)
         learn: LearnSettings = Field(default_factory=LearnSettings)
         work_dir: Path | None = None
         checkpoints_dir: Path = Path("checkpoints")
+
+        @field_validator("name")
+        @classmethod
+        def _check_name(cls, name: str) -> str:
+            # That of a folder, on any system.
+            if not re.fullmatch("[A-Za-z0-9][A-Za-z0-9._-]*", name):
+                raise ValueError("expected letters, digits, '.', '_' and '-', a letter or digit first")
+            return name
 
         @property
         def work_folder(self) -> Path:
@@ -154,8 +159,6 @@ def train(
         )
     if name is None:
         raise ConfigError(f"expected a name for the network, as in --name {paths[0].resolve().stem}")
-    if not re.fullmatch(_NAME, name):
-        raise ConfigError(f"--name {name!r}: expected letters, digits, '.', '_' and '-', the first no sign")
     plain = own_config(name, paths, measured, overrides, Path("runs"))
     settings = check_settings(run_settings_schema(), plain, shlex.join(["lanenet", "train", *sources]))
     check_taken(settings, force)

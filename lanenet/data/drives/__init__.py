@@ -27,6 +27,7 @@ __all__ = [
     "drives_in",
     "find_format",
     "formats_text",
+    "is_photo",
     "meant_instead",
     "open_drive",
     "read_truth",
@@ -94,7 +95,7 @@ def _photos_instead(path: Path) -> str:
     if not is_folder(path):
         return ""
     try:
-        photos = sum(1 for entry in path.iterdir() if entry.suffix.lower() in PHOTO_ENDINGS)
+        photos = sum(map(is_photo, path.iterdir()))
     except OSError:  # a folder that cannot be read shows none
         return ""
     if not photos:
@@ -103,6 +104,12 @@ def _photos_instead(path: Path) -> str:
         f"; it holds {counted(photos, 'image')} without a frames.csv: single photos cannot be mapped, and "
         "lanenet detect takes each of them"
     )
+
+
+def is_photo(path: Path) -> bool:
+    """Return whether a file is a photo, by its name."""
+    # macOS adds a "._name.jpg" beside each file that it copies.
+    return path.suffix.lower() in PHOTO_ENDINGS and not path.name.startswith(".")
 
 
 def drive_above(path: Path) -> Path | None:

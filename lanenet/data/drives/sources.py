@@ -17,6 +17,7 @@ from lanenet.data.drives import (
     drive_above,
     find_format,
     formats_text,
+    is_photo,
     meant_instead,
     open_drive,
 )
@@ -98,7 +99,7 @@ def open_source(path: Path) -> Source:
     if find_format(path) is not None:
         return _recorded(path)
     photos = sorted(path.iterdir()) if path.is_dir() else [path]
-    photos = [photo for photo in photos if _is_photo(photo)]
+    photos = [photo for photo in photos if is_photo(photo)]
     if not photos:
         raise DriveFormatError(
             f"{path}: expected {formats_text()}, or photos ({', '.join(PHOTO_ENDINGS)}), found none of them"
@@ -129,11 +130,6 @@ def check_size(source: Source, camera: Camera, where: Path) -> None:
             f"{where}: the camera is for {camera.width}x{camera.height} px, the images of {source.name} have "
             f"{width}x{height}: expected the camera that took them, at this size; {source.way_to_camera}"
         )
-
-
-def _is_photo(path: Path) -> bool:
-    # macOS adds a "._name.jpg" beside each file that it copies.
-    return path.suffix.lower() in PHOTO_ENDINGS and not path.name.startswith(".")
 
 
 def _photos(path: Path, files: list[Path]) -> Source:

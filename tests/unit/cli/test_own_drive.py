@@ -239,7 +239,7 @@ def test_photos_are_no_drive_and_that_is_said(here: Path) -> None:
         (["mine.yaml", "--name", "a"], "--name: is for drives, but mine.yaml is a config"),
         (["mine.yaml", "--frames", "1:3"], "--frames: is for drives, but mine.yaml is a config"),
         (["drive", "--lane-width", "40", "--name", "a", "learn.epochz=3"], "unknown key 'learn.epochz'"),
-        (["drive", "--lane-width", "40", "--name", "../a"], "--name '../a': expected letters"),
+        (["drive", "--lane-width", "40", "--name", "../a"], "key 'name': expected letters"),
         (["none", "--lane-width", "40", "--name", "a"], "none: no such drive"),
         (["drive", "--lane-width", "40", "--name", "a", "learn.start_from=b"], "b: no such folder"),
     ],
