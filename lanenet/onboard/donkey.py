@@ -45,7 +45,8 @@ from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.drive import DriveDetectorSettings
-from lanenet.onboard.safety import CommandLimiter, LimitSettings, same_image
+from lanenet.onboard.frame_check import same_image
+from lanenet.onboard.safety import CommandLimiter, LimitSettings
 from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.edges.views import View, birdseye_view, undistorting_view

@@ -27,10 +27,10 @@ from lanenet.data.drives.recorder import DriveRecorder
 from lanenet.errors import HardwareError, counted
 from lanenet.onboard.arming import ArmGate, HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
+from lanenet.onboard.frame_check import FrameCheck
 from lanenet.onboard.guard import CommandSink
 from lanenet.onboard.safety import (
     CommandLimiter,
-    FrameCheck,
     LimitSettings,
     SafetyJudge,
     SafetySettings,

@@ -11,18 +11,9 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-from jaxtyping import UInt8
 from pydantic import Field, model_validator
 
 from lanenet.config import Settings
-from lanenet.onboard.devices import Frame
-
-#: A frame time further ahead than this comes from another clock; chosen: more than rounding, less than two
-#: frames.
-_MAX_AHEAD_S = 0.05
-#: Frames are compared in every 16th pixel first; of a 320 x 240 image these are 300 pixels with noise.
-_SAMPLE = 16
 
 
 class LimitSettings(Settings):
@@ -178,33 +169,6 @@ class SafetyJudge:
         return Verdict(state, 0.0, False, fault)
 
 
-class FrameCheck:
-    """Finds frames that must not be used: missing, late, from another clock, or repeated."""
-
-    def __init__(self, settings: SafetySettings) -> None:
-        """Take the limits; no frame has been seen."""
-        self._settings = settings
-        self._before: UInt8[np.ndarray, "h w 3"] | None = None
-
-    def fault_of(self, frame: Frame | None, now_s: float) -> str:
-        """Return what is wrong with a frame; empty if nothing is."""
-        if frame is None:
-            return "no frame from the camera"
-        before, self._before = self._before, frame.image_bgr
-        age_s = now_s - frame.t_s
-        if not math.isfinite(age_s) or age_s < -_MAX_AHEAD_S:
-            return f"frame {frame.number} is timed {-age_s:.2f} s ahead of the clock"
-        if age_s > self._settings.max_age_s:
-            return f"frame {frame.number} is {1e3 * age_s:.0f} ms old"
-        if (
-            not self._settings.allow_repeated_frames
-            and before is not None
-            and same_image(before, frame.image_bgr)
-        ):
-            return f"frame {frame.number} repeats the one before: the camera hangs"
-        return ""
-
-
 class CommandLimiter:
     """Limits steering and throttle, and how fast they change."""
 
@@ -240,13 +204,3 @@ class CommandLimiter:
 
 def _since(before_s: float, now_s: float) -> float:
     return max(0.0, now_s - before_s) if math.isfinite(before_s) else 0.0
-
-
-def same_image(before: UInt8[np.ndarray, "h w 3"], now: UInt8[np.ndarray, "h w 3"]) -> bool:
-    """Tell whether two images are equal, pixel for pixel."""
-    if before.shape != now.shape:
-        return False
-    # Sensor noise makes frames differ in a few pixels; only frames that may be equal are compared in full.
-    if not np.array_equal(before[::_SAMPLE, ::_SAMPLE], now[::_SAMPLE, ::_SAMPLE]):
-        return False
-    return bool(np.array_equal(before, now))
