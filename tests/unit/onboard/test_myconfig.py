@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from lanenet.config import check_settings
 from lanenet.errors import ConfigError
-from lanenet.onboard.actuators.myconfig import read_assignments, settings_from_myconfig, with_myconfig
+from lanenet.onboard.actuators.assignments import read_assignments
+from lanenet.onboard.actuators.heartbeat import HeartbeatSettings
+from lanenet.onboard.actuators.myconfig import settings_from_myconfig, with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings, counts_of, prescale_of
 
 NEW = """
@@ -93,32 +97,55 @@ def test_settings_in_the_yaml_win(write):
 
 def test_only_literals_are_read_and_nothing_is_run(write, tmp_path):
     mark = tmp_path / "mark"
-    path = write(f"A = 1\nB = open({str(mark)!r}, 'w')\nA = A + 1\nC = D = -2.5\nif True:\n    E = 3\n")
-    assert read_assignments(path) == {"A": 2, "C": -2.5, "D": -2.5}
+    path = write(
+        f"A = 1\nB = open({str(mark)!r}, 'w')\nA = A + 1\nC = D = -2.5\nif True:\n    E = 3\nF = {{'G': 4}}"
+    )
+    found = read_assignments(path, lambda name: name == "A", "F")
+    assert {name: (given.value, given.line) for name, given in found.items()} == {
+        "A": (2, 3),
+        "C": (-2.5, 4),
+        "D": (-2.5, 4),
+        "F": ({"G": 4}, 7),
+    }
+    assert found["F"].entries["G"].where == f"{path}, line 7"
     assert not mark.exists()
+
+
+def entry(name, value):
+    """Return the dictionary of ``NEW`` with another value."""
+    return re.sub(rf'("{name}"): [^,]+,', rf"\1: {value},", NEW)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('DRIVE_TRAIN_TYPE = "VESC"', "DRIVE_TRAIN_TYPE 'VESC', expected"),
-        ('PWM_STEERING_THROTTLE = "x"', "expected a dictionary"),
+        ('DRIVE_TRAIN_TYPE = "VESC"', "line 1: DRIVE_TRAIN_TYPE: found 'VESC', expected .*SERVO_ESC.* pilot"),
+        ("\nDRIVE_TRAIN_TYPE = None", "line 2: DRIVE_TRAIN_TYPE: found None"),
+        ('PWM_STEERING_THROTTLE = "x"', "line 1: PWM_STEERING_THROTTLE: found 'x', expected a dictionary"),
         (
-            'PWM_STEERING_THROTTLE = {"PWM_STEERING_PIN": "RPI_GPIO.BOARD.33"}',
-            "expected for example 'PCA9685.1:40",
+            entry("PWM_STEERING_PIN", '"RPI_GPIO.BOARD.33"'),
+            "line 7: PWM_STEERING_PIN: found 'RPI_GPIO.*40.1'",
         ),
-        ('PWM_STEERING_THROTTLE = {"PWM_THROTTLE_INVERTED": True}', "PWM_THROTTLE_INVERTED: found True"),
-        ('STEERING_LEFT_PWM = "460"', "STEERING_LEFT_PWM: expected a number, found '460'"),
+        (entry("PWM_THROTTLE_PIN", '"PIGPIO.BCM.13"'), "line 10: PWM_THROTTLE_PIN: found 'PIGPIO.BCM.13'"),
+        (entry("PWM_THROTTLE_PIN", '"PCA9685.1:41.16"'), "line 10: .*expected a channel from 0 to 15"),
         (
-            'PWM_STEERING_THROTTLE = {"PWM_STEERING_PIN": "PCA9685.1:40.1", '
-            '"PWM_THROTTLE_PIN": "PCA9685.1:41.0"}',
-            "two chips",
+            entry("PWM_STEERING_PIN", '"PCA9685.1:80.1"'),
+            "line 7: .*expected an I2C address from 0x03 to 0x77",
         ),
-        (
-            'DRIVE_TRAIN_TYPE = "I2C_SERVO"\nSTEERING_CHANNEL = "1"',
-            "STEERING_CHANNEL: expected a whole number",
-        ),
-        ("STEERING_LEFT_PWM = 1e999", "STEERING_LEFT_PWM: expected a number, found inf"),
+        (entry("PWM_THROTTLE_PIN", '"PCA9685.1:40.2"'), "line 10: .*two chips"),
+        (entry("PWM_THROTTLE_INVERTED", True), "line 12: PWM_THROTTLE_INVERTED: found True, expected False"),
+        (entry("PWM_STEERING_SCALE", 0), "line 8: PWM_STEERING_SCALE: found 0, expected a positive number"),
+        (entry("PWM_STEERING_SCALE", 2), "STEERING_LEFT_PWM: found 440, expected 123 to 612, .*its scale 2"),
+        ('STEERING_LEFT_PWM = "460"', "line 1: STEERING_LEFT_PWM: found '460', expected a number"),
+        ("STEERING_LEFT_PWM = 4000", "line 1: STEERING_LEFT_PWM: found 4000, expected 123 to 612, .*2.5 ms"),
+        ("STEERING_LEFT_PWM = 1e999", "STEERING_LEFT_PWM: found inf, expected a number"),
+        ("A = 1e200\nSTEERING_LEFT_PWM = A * A", "line 2: STEERING_LEFT_PWM: found inf, expected a number"),
+        ('STEERING_CHANNEL = "1"', "line 1: STEERING_CHANNEL: found '1', expected a whole number"),
+        ("THROTTLE_CHANNEL = 16", "line 1: THROTTLE_CHANNEL: found 16, expected a channel from 0 to 15"),
+        ("PCA9685_I2C_ADDR = None", "line 1: PCA9685_I2C_ADDR: found None, expected a whole number"),
+        ("PCA9685_I2C_BUSNUM = -1", "line 1: PCA9685_I2C_BUSNUM: found -1, expected an I2C bus"),
+        ("PCA9685_I2C_ADDR1 = 0x60", "line 1: PCA9685_I2C_ADDR1: found a name of other outputs"),
+        ("STEERING_ARDUINO_PIN = 6", "line 1: STEERING_ARDUINO_PIN: found a name of other outputs"),
         ("THIS IS NOT PYTHON", "not Python"),
     ],
 )
@@ -190,7 +217,7 @@ STEERING_CENTER_PWM = 370
 STEERING_WIDTH_PWM = 80
 STEERING_LEFT_PWM = STEERING_CENTER_PWM + STEERING_WIDTH_PWM
 STEERING_RIGHT_PWM = STEERING_CENTER_PWM - 2 * STEERING_WIDTH_PWM // 2
-PWM_STEERING_THROTTLE = {"THROTTLE_STOPPED_PWM": STEERING_CENTER_PWM - 10}
+THROTTLE_STOPPED_PWM = STEERING_CENTER_PWM - 10
 print(STEERING_LEFT_PWM)
 """
     found, prescale = settings_from_myconfig(write(text)), prescale_of(60.0)
@@ -200,7 +227,7 @@ print(STEERING_LEFT_PWM)
 
 def test_values_out_of_range_name_the_file(write):
     path = write("STEERING_LEFT_PWM = 4000")
-    with pytest.raises(ConfigError, match=r"myconfig\.py: key 'steering_left_us'.*2500"):
+    with pytest.raises(ConfigError, match=r"myconfig\.py, line 1: STEERING_LEFT_PWM"):
         with_myconfig(PCA9685Settings(myconfig=path))
 
 
@@ -219,3 +246,143 @@ def test_an_encoding_that_hides_a_line_is_refused(write):
 def test_missing_file(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         settings_from_myconfig(tmp_path / "myconfig.py")
+
+
+PINS = """
+PWM_STEERING_PIN = "PCA9685.0:41.3"
+PWM_THROTTLE_PIN = "PCA9685.0:41.2"
+PWM_STEERING_SCALE = 0.5
+"""
+
+
+def places(found):
+    return found.get("bus"), found.get("address"), found["steering_channel"], found.get("throttle_channel")
+
+
+def test_the_drive_train_type_decides_between_the_forms_of_one_file(write):
+    # As in Donkeycar's own templates, where all forms stand.
+    assert places(settings_from_myconfig(write(NEW + OLD))) == (None, 0x60, 5, None)
+    found = settings_from_myconfig(write(OLD + NEW))
+    assert places(found) == (1, 0x41, 3, 2)
+    assert counts_of(found["steering_left_us"], prescale_of(60.0)) == 440
+
+
+def test_pins_at_the_top_level(write):
+    for kind in ("", 'DRIVE_TRAIN_TYPE = "PWM_STEERING_THROTTLE"'):
+        found = settings_from_myconfig(write(PINS + "STEERING_LEFT_PWM = 900\n" + kind))
+        assert places(found) == (0, 0x41, 3, 2)
+        assert counts_of(found["steering_left_us"], prescale_of(60.0)) == 450
+
+
+@pytest.mark.parametrize("kind", ["", 'DRIVE_TRAIN_TYPE = "I2C_SERVO"', 'DRIVE_TRAIN_TYPE = "SERVO_ESC"'])
+def test_channels_with_and_without_their_type(write, kind):
+    text = "STEERING_CHANNEL = 0\nTHROTTLE_CHANNEL = 1\nPCA9685_I2C_ADDR = 0x41\nPCA9685_I2C_BUSNUM = 0\n"
+    assert places(settings_from_myconfig(write(text + kind))) == (0, 0x41, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            re.sub('"(PWM_THROTTLE_PIN|THROTTLE_REVERSE_PWM)".*', "", NEW),
+            "without PWM_THROTTLE_PIN, THROTTLE_R",
+        ),
+        (
+            'DRIVE_TRAIN_TYPE = "PWM_STEERING_THROTTLE"',
+            "line 1: .*without PWM_STEERING_PIN, PWM_THROTTLE_PIN",
+        ),
+        (PINS.replace("PWM_THROTTLE_PIN", "# "), "line 2: PWM_STEERING_THROTTLE without PWM_THROTTLE_PIN;"),
+        (
+            '# none\nPWM_THROTTLE_PIN = "PCA9685.1:40.0"',
+            "line 2: PWM_STEERING_THROTTLE without PWM_STEERING_PIN;",
+        ),
+    ],
+)
+def test_half_of_a_form_names_what_is_missing(write, text, message):
+    with pytest.raises(ConfigError, match=message):
+        settings_from_myconfig(write(text))
+
+
+@pytest.mark.parametrize(
+    ("config", "mine", "words"),
+    [
+        # Versions differ in which form they read, and the files do not tell the version.
+        (
+            "",
+            NEW + PINS,
+            ["line 20", "PWM_STEERING_PIN 'PCA9685.0:41.3'", "PCA9685.1:41.3' (myconfig.py, line 7)"],
+        ),
+        (
+            "",
+            NEW.replace("DRIVE_TRAIN_TYPE", "OTHER") + "THROTTLE_CHANNEL = 3",
+            ["line 19", "THROTTLE_CHANNEL 3"],
+        ),
+        ("", PINS + "STEERING_CHANNEL = 4", ["line 5", "STEERING_CHANNEL 4", "PCA9685.0:41.3"]),
+        # What a person wrote does not give way to Donkeycar's default.
+        (
+            NEW,
+            "\nTHROTTLE_CHANNEL = 3",
+            ["line 2", "THROTTLE_CHANNEL 3", "PCA9685.1:41.2' (config.py, line 10)"],
+        ),
+        (NEW, "STEERING_LEFT_PWM = 430", ["line 1", "STEERING_LEFT_PWM 430", "440 (config.py, line 13)"]),
+        (NEW, PINS, ["line 2", "PCA9685.0:41.3"]),
+        (
+            OLD + "THROTTLE_CHANNEL = 1",
+            PINS,
+            ["line 2", "PCA9685.0:41.3", "PCA9685_I2C_ADDR 96 (config.py, line 4)"],
+        ),
+    ],
+)
+def test_lines_that_disagree_are_refused(write, config, mine, words):
+    write(config, "config.py")
+    with pytest.raises(ConfigError) as caught:
+        settings_from_myconfig(write(mine))
+    for word in ("myconfig.py", *words):
+        assert word in str(caught.value)
+
+
+def test_lines_that_agree_or_are_not_read_are_taken(write):
+    write(NEW + OLD.replace("DRIVE_TRAIN_TYPE", "OTHER"), "config.py")
+    agreeing = "PCA9685_I2C_BUSNUM = 1\nSTEERING_CHANNEL = 3\nSTEERING_LEFT_PWM = 440\n"
+    assert places(settings_from_myconfig(write(agreeing))) == (1, 0x41, 3, 2)
+    assert places(settings_from_myconfig(write("PWM_STEERING_THROTTLE_2 = {}\nSTEERING_PWM_FREQ = 50"))) == (
+        1,
+        0x41,
+        3,
+        2,
+    )
+    assert places(settings_from_myconfig(write('DRIVE_TRAIN_TYPE = "I2C_SERVO"'))) == (None, 0x60, 5, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "own", "words"),
+    [
+        (
+            "STEERING_CHANNEL = 0",
+            {},
+            ["STEERING_CHANNEL 0 (myconfig.py, line 1)", "THROTTLE_CHANNEL 0 (Donkeycar's"],
+        ),
+        ("STEERING_CHANNEL = 4", {"throttle_channel": 4}, ["STEERING_CHANNEL 4", "throttle_channel=4"]),
+        ("STEERING_LEFT_PWM = 290", {}, ["STEERING_LEFT_PWM 290", "STEERING_RIGHT_PWM 290 (Donkeycar's"]),
+        (
+            "\nTHROTTLE_STOPPED_PWM = 510",
+            {},
+            ["THROTTLE_STOPPED_PWM 510 (myconfig.py, line 2)", "FORWARD_PWM 500"],
+        ),
+    ],
+)
+def test_values_that_do_not_fit_together_are_named_as_in_the_file(write, text, own, words):
+    with pytest.raises(ConfigError) as caught:
+        with_myconfig(PCA9685Settings(myconfig=write(text), **own))
+    assert "{" not in str(caught.value)
+    for word in ("under actuator:", *words):
+        assert word in str(caught.value)
+
+
+def test_a_rule_of_the_bus_keeps_its_words(write):
+    # GPIO 3 is the clock of bus 1, which the rule calls the I2C bus.
+    own = {"heartbeat": HeartbeatSettings(line=3)}
+    with pytest.raises(
+        ConfigError, match=r"PCA9685_I2C_BUSNUM 1 \(myconfig.py, line 1\) \[bus=1\]: .* I2C bus"
+    ):
+        with_myconfig(PCA9685Settings(myconfig=write("PCA9685_I2C_BUSNUM = 1"), **own))
