@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from lanenet.errors import ConfigError, LanenetError, did_you_mean
 from lanenet.reading import MEBIBYTE, parsing, read_text
@@ -37,10 +40,51 @@ def _with_strict_numbers(schema: Any) -> Any:
     return {k: v if k in kept else _with_strict_numbers(v) for k, v in schema.items()} | strict
 
 
+@dataclass(frozen=True)
+class Rule:
+    """Settings that constrain each other, in the section to which all of them belong.
+
+    Attributes:
+        keys: Their dotted keys in this section. A rule does not apply where a section on the way is missing.
+        holds: Whether the section's values can be right.
+        expected: What would be, for the error, which shows keys and values itself.
+    """
+
+    keys: tuple[str, ...]
+    holds: Callable[[Any], bool]
+    expected: Callable[[Any], str]
+
+
 class Settings(BaseModel):
-    """Base of every settings schema."""
+    """Base of every settings schema.
+
+    Attributes:
+        rules: Of this section; those of the sections in it are their own.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    rules: ClassVar[tuple[Rule, ...]] = ()
+
+    def open_keys(self) -> frozenset[str]:
+        """Return the keys whose values come later, from elsewhere; their rules wait for them."""
+        return frozenset()
+
+    @model_validator(mode="after")
+    def _check_rules(self) -> Settings:
+        """Report every rule that does not hold at once: mending one value may take another."""
+        later, broken = self.open_keys(), []
+        for rule in self.rules:
+            values = [_value_at(self, key) for key in rule.keys]
+            if (
+                not any(value is _ABSENT for value in values)
+                and later.isdisjoint(rule.keys)
+                and not rule.holds(self)
+            ):
+                broken.append((rule.keys, values, rule.expected(self)))
+        if broken:
+            raise PydanticCustomError("rules", "settings that cannot be right", {"broken": broken})
+        return self
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
@@ -49,6 +93,15 @@ class Settings(BaseModel):
 
 
 SettingsT = TypeVar("SettingsT", bound=Settings)
+
+_ABSENT = object()
+
+
+def _value_at(section: Any, key: str) -> Any:
+    """Return the value of a dotted key; ``_ABSENT`` where one of its sections is missing."""
+    for part in key.split("."):
+        section = getattr(section, part, _ABSENT)
+    return section
 
 
 def flat_settings(settings: Settings) -> dict[str, Any]:
@@ -233,10 +286,13 @@ def to_yaml(data: dict[str, Any]) -> str:
 
 
 def _describe(schema: type[BaseModel], error: Any) -> str:
-    location = [str(part) for part in error["loc"]]
+    location, _ = _place(schema, error["loc"])
     key = ".".join(location) or "(top level)"
+    if error["type"] == "rules":
+        return "; ".join(_describe_rule(location, *broken) for broken in error["ctx"]["broken"])
     if error["type"] == "extra_forbidden":
-        known = _known_keys(schema, location[:-1])
+        _, sections = _place(schema, error["loc"][:-1])
+        known = [name for section in sections for name in section.model_fields]
         hint = did_you_mean(location[-1], known) or f", known keys: {', '.join(sorted(known))}"
         return f"unknown key {key!r}{hint}"
     if error["type"] == "missing":
@@ -248,15 +304,42 @@ def _describe(schema: type[BaseModel], error: Any) -> str:
     return f"key {key!r}: {message}, found {shown[:80]}"
 
 
-def _known_keys(schema: type[BaseModel], path: list[str]) -> list[str]:
-    """Return the field names of the schema nested at ``path``; list indices and union tags are skipped."""
-    for part in path:
-        field = schema.model_fields.get(part)
-        if field is None:
+def _describe_rule(location: list[str], keys: tuple[str, ...], values: list[Any], expected: str) -> str:
+    *first, last = [
+        f"{'.'.join([*location, key])}={_shown(value)}" for key, value in zip(keys, values, strict=True)
+    ]
+    return f"found {', '.join(first)}{' and ' if first else ''}{last}: {expected}"
+
+
+def _shown(value: Any) -> str:
+    """Return a value as a file or an override has it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _place(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], list[type[BaseModel]]]:
+    """Return the keys of an error as the file has them, and the schemas of the section at their end.
+
+    pydantic's own location holds the ``kind`` as well by which it tells one section from another.
+    """
+    keys: list[str] = []
+    models = [schema]
+    for part in map(str, location):
+        fields = [model.model_fields[part].annotation for model in models if part in model.model_fields]
+        of_kind = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == part]
+        if of_kind and not fields:
+            models = of_kind
             continue
-        candidates = [field.annotation, *getattr(field.annotation, "__args__", ())]
-        nested = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
-        if not nested:
-            return []
-        schema = nested[0]
-    return list(schema.model_fields)
+        keys.append(part)
+        # The number of an entry of a list is no field.
+        models = [model for field in fields for model in _models_in(field)] if fields else models
+    return keys, models
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the schemas of a field's type: one, or several that the section's ``kind`` chooses from."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models_in(part)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from lanenet.config import Settings
+from lanenet.config import Rule, Settings
 from lanenet.control.plausibility import JumpCheck, fault_of, misfit_of
 from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
 from lanenet.control.steering import SteeringSettings, corner_target_rad, steering_target_rad
@@ -29,19 +30,26 @@ class SpeedSettings(Settings):
         cm_s_per_throttle: Speed per throttle above that, from a timed distance.
     """
 
+    rules: ClassVar[tuple[Rule, ...]] = (
+        Rule(
+            ("least_cm_s", "cruise_cm_s"),
+            lambda s: s.least_cm_s <= s.cruise_cm_s,
+            lambda s: (
+                f"expected least_cm_s at most {s.cruise_cm_s:g} cm/s: bends are not faster than straights"
+            ),
+        ),
+    )
+
     cruise_cm_s: float = Field(default=60.0, gt=0.0)
     least_cm_s: float = Field(default=30.0, gt=0.0)
     max_lateral_cm_s2: float = Field(default=150.0, gt=0.0)
     throttle_at_rest: float = Field(default=0.1, ge=0.0, lt=1.0)
     cm_s_per_throttle: float = Field(default=400.0, gt=0.0)
 
-    @model_validator(mode="after")
-    def _check_order(self) -> SpeedSettings:
-        if self.least_cm_s > self.cruise_cm_s:
-            raise ValueError(
-                f"expected least_cm_s below cruise_cm_s, found {self.least_cm_s:g} above {self.cruise_cm_s:g}"
-            )
-        return self
+    @property
+    def cruise_throttle(self) -> float:
+        """Throttle of the cruise speed, not limited: above 1 there is no such speed."""
+        return self.throttle_at_rest + self.cruise_cm_s / self.cm_s_per_throttle
 
 
 def lane_curvature_per_cm(estimate: LaneEstimate, y_cm: float) -> float:

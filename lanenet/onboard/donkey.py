@@ -30,14 +30,14 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from jaxtyping import Num, UInt8
 from pydantic import Field
 
-from lanenet.config import Settings, check_settings, load_settings
+from lanenet.config import Rule, Settings, check_settings, load_settings
 from lanenet.control.controller import ControlSettings, LaneController, throttle_of
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives.sources import read_mask
@@ -46,6 +46,7 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.drive import DriveDetectorSettings
 from lanenet.onboard.frame_check import same_image
+from lanenet.onboard.rules import PILOT_RULES
 from lanenet.onboard.safety import CommandLimiter, LimitSettings
 from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.draw import draw_estimate
@@ -80,11 +81,13 @@ class DonkeySettings(Settings):
             stop, when the camera seems to have moved. It starts anew when a person has driven.
     """
 
+    rules: ClassVar[tuple[Rule, ...]] = PILOT_RULES
+
     camera: Path | None = None
     detector: DriveDetectorSettings = DriveDetectorSettings()
     control: ControlSettings
     limits: LimitSettings = Field(default_factory=LimitSettings)
-    min_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
+    min_confidence: float = Field(default=0.3, gt=0.0, le=1.0)
     hold_s: float = Field(default=0.2, ge=0.0)
     allow_repeated_frames: bool = False
     camera_check: bool = True

@@ -6,13 +6,13 @@ import json
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import cv2
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
+from lanenet.config import Rule, Settings, apply_overrides, check_settings, read_yaml
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings, new_drive_folder
@@ -24,10 +24,12 @@ from lanenet.onboard.actuators import ActuatorSettings, first_writes, make_actua
 from lanenet.onboard.actuators.pulses import PulseSettings
 from lanenet.onboard.arming import ArmCheck, ArmGate, HoldFile
 from lanenet.onboard.cameras import SourceSettings, open_source
+from lanenet.onboard.cameras.live import CameraSettings
 from lanenet.onboard.cameras.replay import ReplaySettings
 from lanenet.onboard.devices import Frame
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, Step
+from lanenet.onboard.rules import CAR_RULES, DETECTOR_RULES
 from lanenet.onboard.safety import LimitSettings, SafetySettings
 from lanenet.perception.camera_check import CameraCheck
 from lanenet.perception.estimate import Detector, DetectorInputs, LaneEstimate
@@ -55,6 +57,8 @@ class DriveDetectorSettings(Settings):
         lane_width_cm: Between the middles of the two lines, for the lane filter.
     """
 
+    rules: ClassVar[tuple[Rule, ...]] = DETECTOR_RULES
+
     kind: Annotated[str, AfterValidator(_known_detector)] = "network"
     model: Path | None = None
     config: Path | None = None
@@ -77,6 +81,8 @@ class DriveSettings(Settings):
         recording: Record the drive; None for no recording.
         threads: Threads of OpenCV; the network uses one.
     """
+
+    rules: ClassVar[tuple[Rule, ...]] = CAR_RULES
 
     source: SourceSettings
     camera: Path | None = None
@@ -146,6 +152,7 @@ def build_loop(
         _refuse_blind_drive(settings)
     cv2.setNumThreads(settings.threads)
     camera = None if settings.camera is None else read_camera(settings.camera)
+    _refuse_another_size(settings, camera)
     safety = settings.safety
     if dry_run:
         safety = safety.model_copy(update={"countdown_s": 0.0, "end_after_s": _NEVER_S})
@@ -223,6 +230,19 @@ def _refuse_blind_drive(settings: DriveSettings) -> None:
         raise ConfigError(
             f"key 'source.kind': found 'replay' ({source.path}) for an armed car, which would drive blind; "
             "expected a camera, or source.may_drive=true for a car whose wheels are off the ground"
+        )
+
+
+def _refuse_another_size(settings: DriveSettings, camera: Camera | None) -> None:
+    """Keep a camera from sending images of another size than its camera file is for."""
+    source = settings.source
+    if camera is None or not isinstance(source, CameraSettings):
+        return
+    if (source.width, source.height) != (camera.width, camera.height):
+        raise ConfigError(
+            f"found source.width={source.width}, source.height={source.height} and a camera file "
+            f"({settings.camera}) of {camera.width}x{camera.height} px: expected one size, or the file "
+            "of another camera"
         )
 
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from lanenet.config import Settings
+from lanenet.config import Rule, Settings
 
 
 class LimitSettings(Settings):
@@ -43,7 +44,7 @@ class SafetySettings(Settings):
         max_age_s: A command is valid until its frame is this old; at the default and 1 m/s the car has moved
             10 cm.
         countdown_s: An armed car starts after it has seen the lane for this long without interruption.
-        slow_below: Below this confidence the car slows down.
+        slow_below: Below this confidence the car slows down. Not 0, which an image without a lane has.
         slow_share: Share of the speed that remains at ``stop_below``.
         stop_below: Below this confidence the car stops.
         slow_for_s: A car that has been slow for this long stops.
@@ -54,25 +55,32 @@ class SafetySettings(Settings):
             the camera seems to have moved.
     """
 
+    rules: ClassVar[tuple[Rule, ...]] = (
+        Rule(
+            ("stop_below", "slow_below"),
+            lambda s: s.stop_below <= s.slow_below,
+            lambda _: "expected stop_below at or below slow_below: the car slows down before it stops",
+        ),
+        Rule(
+            ("end_after_s", "watchdog_s"),
+            lambda s: s.end_after_s > s.watchdog_s,
+            lambda s: (
+                f"expected end_after_s above {s.watchdog_s:g} s: a command that is still valid must not "
+                "end the drive"
+            ),
+        ),
+    )
+
     watchdog_s: float = Field(default=0.08, gt=0.0, le=0.5)
     max_age_s: float = Field(default=0.1, gt=0.0, le=0.5)
     countdown_s: float = Field(default=3.0, ge=0.0)
-    slow_below: float = Field(default=0.5, ge=0.0, le=1.0)
+    slow_below: float = Field(default=0.5, gt=0.0, le=1.0)
     slow_share: float = Field(default=0.5, gt=0.0, le=1.0)
-    stop_below: float = Field(default=0.2, ge=0.0, le=1.0)
+    stop_below: float = Field(default=0.2, gt=0.0, le=1.0)
     slow_for_s: float = Field(default=3.0, gt=0.0)
     end_after_s: float = Field(default=1.0, ge=0.2)
     allow_repeated_frames: bool = False
     camera_check: bool = True
-
-    @model_validator(mode="after")
-    def _check_order(self) -> SafetySettings:
-        if self.stop_below > self.slow_below:
-            raise ValueError(
-                f"expected stop_below at or below slow_below, found {self.stop_below:g} above "
-                f"{self.slow_below:g}"
-            )
-        return self
 
 
 class State(StrEnum):

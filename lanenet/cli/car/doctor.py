@@ -64,7 +64,7 @@ def _try_wheels(config: Path, settings: DriveSettings) -> None:
     """Ask about the wheels on the terminal, and write the result into the car's file."""
     from lanenet.data.files import write_text
     from lanenet.onboard.doctor.wheel_trial import pulses_of, set_values, try_wheels
-    from lanenet.onboard.drive import build_sink
+    from lanenet.onboard.drive import build_sink, load_drive_settings
 
     def ask(question: str, letters: str) -> str:
         while True:
@@ -79,4 +79,6 @@ def _try_wheels(config: Path, settings: DriveSettings) -> None:
         text = config.read_text(encoding="utf-8")
         write_text(config, set_values(text, result.changes, str(config)))
         console.wrote(config)
+        # What was found may rule out what the file says: then it is told here, with what to write.
+        load_drive_settings(config)
     console.next_command("drive", config, "--steering-only")

@@ -21,6 +21,8 @@ _VALUES = struct.Struct("=QQ")
 #: _IOWR(0xB4, 0x07, _REQUEST) and _IOWR(0xB4, 0x0F, _VALUES).
 GET_LINE, SET_VALUES = 0xC000B407 | _REQUEST.size << 16, 0xC000B40F | _VALUES.size << 16
 _OUTPUT = 1 << 3
+#: Device of the lines on a Raspberry Pi's header.
+HEADER = "/dev/gpiochip0"
 _HIGH, _LOW = _VALUES.pack(1, 1), _VALUES.pack(0, 1)
 
 
@@ -33,7 +35,7 @@ class HeartbeatSettings(Settings):
     """
 
     line: int = Field(ge=0, le=1023)
-    chip: str = "/dev/gpiochip0"
+    chip: str = HEADER
 
 
 class Heartbeat:

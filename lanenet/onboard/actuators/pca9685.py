@@ -12,12 +12,13 @@ import logging
 import threading
 import time
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from lanenet.config import Rule
 from lanenet.errors import HardwareError
-from lanenet.onboard.actuators.heartbeat import Heartbeat, HeartbeatSettings
+from lanenet.onboard.actuators.heartbeat import HEADER, Heartbeat, HeartbeatSettings
 from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_pulses, neutral_pulses
 from lanenet.onboard.i2c import I2CChip
 
@@ -29,8 +30,24 @@ OSCILLATOR_HZ = 25e6
 COUNTS = 4096
 #: After every write of the start; the oscillator needs 0.5 ms to start after sleep.
 PAUSE_S = 0.001
+#: GPIO lines of the two I2C buses on a Raspberry Pi's header.
+_I2C_LINES = {0: (0, 1), 1: (2, 3)}
+_PULSES = (
+    "steering_left_us", "steering_right_us", "throttle_forward_us", "throttle_stopped_us",
+    "throttle_reverse_us",
+)  # fmt: skip
+#: What a ``myconfig.py`` may set.
+_FROM_MYCONFIG = frozenset({*_PULSES, "bus", "address", "steering_channel", "throttle_channel"})
 
 _log = logging.getLogger(__name__)
+
+
+def _shorter_than_the_period(pulse: str) -> Rule:
+    return Rule(
+        (pulse, "frequency_hz"),
+        lambda s: counts_of(getattr(s, pulse), prescale_of(s.frequency_hz)) < COUNTS,
+        lambda s: f"expected a pulse shorter than the period of {_period_us(s.frequency_hz):.0f} us",
+    )
 
 
 class PCA9685Settings(PulseSettings):
@@ -49,6 +66,21 @@ class PCA9685Settings(PulseSettings):
             at its OE pin; None if there is none.
     """
 
+    rules: ClassVar[tuple[Rule, ...]] = (
+        *PulseSettings.rules,
+        Rule(
+            ("steering_channel", "throttle_channel"),
+            lambda s: s.steering_channel != s.throttle_channel,
+            lambda _: "expected two channels: the motor must not get the pulses of the steering",
+        ),
+        *map(_shorter_than_the_period, _PULSES),
+        Rule(
+            ("heartbeat.line", "heartbeat.chip", "bus"),
+            lambda s: s.heartbeat.chip != HEADER or s.heartbeat.line not in _I2C_LINES.get(s.bus, ()),
+            lambda _: "expected a line that is not one of this I2C bus, which would end with the first pulse",
+        ),
+    )
+
     kind: Literal["pca9685"] = "pca9685"
     myconfig: Path | None = None
     bus: int = Field(default=1, ge=0)
@@ -57,6 +89,10 @@ class PCA9685Settings(PulseSettings):
     steering_channel: int = Field(default=1, ge=0, le=15)
     throttle_channel: int = Field(default=0, ge=0, le=15)
     heartbeat: HeartbeatSettings | None = None
+
+    def open_keys(self) -> frozenset[str]:
+        """Return what ``myconfig`` may still set."""
+        return frozenset() if self.myconfig is None else _FROM_MYCONFIG - self.model_fields_set
 
 
 def prescale_of(frequency_hz: float) -> int:
@@ -67,6 +103,11 @@ def prescale_of(frequency_hz: float) -> int:
 def counts_of(pulse_us: float, prescale: int) -> int:
     """Return the length of a pulse in counts of the chip, 4096 of which make one period."""
     return round(pulse_us * 1e-6 * OSCILLATOR_HZ / (prescale + 1))
+
+
+def _period_us(frequency_hz: float) -> float:
+    """Return the chip's period at the nearest rate that it can."""
+    return 1e6 * COUNTS * (prescale_of(frequency_hz) + 1) / OSCILLATOR_HZ
 
 
 def neutral_writes(settings: PCA9685Settings) -> list[bytes]:

@@ -7,14 +7,21 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from lanenet.config import Settings
+from lanenet.config import Rule, Settings
 from lanenet.errors import HardwareError
 
 #: Servos and speed controllers take pulses of 1 to 2 ms; some take half a millisecond more.
 SHORTEST_US, LONGEST_US = 500.0, 2500.0
+#: From a pulse in the middle to one at an end. Chosen: a tenth of the 500 us that servos and speed
+#: controllers take; a speed controller holds neutral for about that.
+LEAST_TRAVEL_US = 50.0
+#: Largest trim as a share of ``max_steering_rad``. Chosen: to the side of the trim the wheels still turn by
+#: half of the angle; beyond it, the servo's horn has to be refitted.
+MOST_TRIM = 0.5
 
 
 class PulseSettings(Settings):
@@ -30,8 +37,43 @@ class PulseSettings(Settings):
         steering_right_us: Pulse at the right end.
         throttle_forward_us: Pulse of throttle 1.
         throttle_stopped_us: Pulse of throttle 0: neutral.
-        throttle_reverse_us: Pulse of throttle -1.
+        throttle_reverse_us: Pulse of throttle -1, which no drive commands; equal to ``throttle_stopped_us``
+            for a speed controller without reverse.
     """
+
+    rules: ClassVar[tuple[Rule, ...]] = (
+        Rule(
+            ("steering_left_us", "steering_right_us"),
+            lambda s: abs(s.steering_left_us - s.steering_right_us) >= 2.0 * LEAST_TRAVEL_US,
+            lambda _: (
+                f"expected them {2.0 * LEAST_TRAVEL_US:g} us apart or more, else the wheels cannot turn"
+            ),
+        ),
+        Rule(
+            ("throttle_stopped_us", "throttle_forward_us", "throttle_reverse_us"),
+            lambda s: _has_sides(s.throttle_reverse_us, s.throttle_stopped_us, s.throttle_forward_us),
+            lambda _: (
+                "expected throttle_stopped_us between the two others, or equal to throttle_reverse_us if "
+                "the speed controller has no reverse"
+            ),
+        ),
+        Rule(
+            ("throttle_stopped_us", "throttle_forward_us"),
+            lambda s: abs(s.throttle_forward_us - s.throttle_stopped_us) >= LEAST_TRAVEL_US,
+            lambda _: (
+                f"expected them {LEAST_TRAVEL_US:g} us apart or more: closer, every throttle is neutral, "
+                "or none is"
+            ),
+        ),
+        Rule(
+            ("steering_trim_rad", "max_steering_rad"),
+            lambda s: abs(s.steering_trim_rad) <= MOST_TRIM * s.max_steering_rad,
+            lambda s: (
+                f"expected a trim of {MOST_TRIM * s.max_steering_rad:g} rad at most, half of the servo's "
+                "travel to a side: refit the servo's horn"
+            ),
+        ),
+    )
 
     max_steering_rad: float = Field(default=0.45, gt=0.0, lt=math.pi / 2.0)
     steering_trim_rad: float = Field(default=0.0, ge=-0.3, le=0.3)
@@ -41,17 +83,11 @@ class PulseSettings(Settings):
     throttle_stopped_us: float = Field(default=1509.6, ge=SHORTEST_US, le=LONGEST_US)
     throttle_reverse_us: float = Field(default=897.6, ge=SHORTEST_US, le=LONGEST_US)
 
-    @model_validator(mode="after")
-    def _check_order(self) -> PulseSettings:
-        if self.steering_left_us == self.steering_right_us:
-            raise ValueError("steering_left_us and steering_right_us are equal, so the wheels cannot turn")
-        low, high = sorted((self.throttle_forward_us, self.throttle_reverse_us))
-        if not low < self.throttle_stopped_us < high:
-            raise ValueError(
-                f"throttle_stopped_us {self.throttle_stopped_us:g} does not lie between throttle_forward_us "
-                f"{self.throttle_forward_us:g} and throttle_reverse_us {self.throttle_reverse_us:g}"
-            )
-        return self
+
+def _has_sides(reverse_us: float, stopped_us: float, forward_us: float) -> bool:
+    """Tell whether neutral lies between the two ends; that of reverse may be neutral."""
+    low_us, high_us = sorted((reverse_us, forward_us))
+    return low_us <= stopped_us <= high_us
 
 
 @dataclass(frozen=True)

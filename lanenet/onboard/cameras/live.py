@@ -9,14 +9,14 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 from pydantic import Field
 
-from lanenet.config import Settings
+from lanenet.config import Rule, Settings
 from lanenet.errors import HardwareError
 from lanenet.onboard.devices import Frame, FrameSource
 
@@ -33,6 +33,15 @@ _JOIN_S = 3.0
 _OLDEST_S = 1.0
 
 
+def _longer_than_a_frame(key: str) -> Rule:
+    """Return the rule by which a camera is not lost between two of its frames."""
+    return Rule(
+        (key, "rate_hz"),
+        lambda s: getattr(s, key) * s.rate_hz > 1.0,
+        lambda s: f"expected more than {1.0 / s.rate_hz:.3g} s, the time between two frames",
+    )
+
+
 class CameraSettings(Settings):
     """Settings of all cameras.
 
@@ -46,6 +55,8 @@ class CameraSettings(Settings):
         silence_s: A camera that sends no frame for this long counts as lost.
         give_up_s: For how long a lost camera is restarted.
     """
+
+    rules: ClassVar[tuple[Rule, ...]] = (_longer_than_a_frame("start_s"), _longer_than_a_frame("silence_s"))
 
     width: int = Field(default=320, ge=16, le=4096)
     height: int = Field(default=240, ge=16, le=4096)

@@ -8,12 +8,13 @@ import shutil
 import subprocess
 import tempfile
 import time
-from typing import IO, Literal
+from typing import IO, ClassVar, Literal
 
 import cv2
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
+from lanenet.config import Rule
 from lanenet.errors import HardwareError
 from lanenet.onboard.cameras.live import CameraSettings, Capture, stop_quietly
 
@@ -41,20 +42,23 @@ class RpicamSettings(CameraSettings):
         options: More arguments for it, for example ``[--shutter, "8000"]``.
     """
 
+    rules: ClassVar[tuple[Rule, ...]] = (
+        *CameraSettings.rules,
+        Rule(
+            ("codec", "width", "height"),
+            lambda s: s.codec != "yuv420" or not (s.width % _ROW_BYTES or s.height % 2),
+            lambda _: (
+                f"codec yuv420 needs a width that is a multiple of {_ROW_BYTES} and an even height; use "
+                "codec mjpeg"
+            ),
+        ),
+    )
+
     kind: Literal["rpicam"] = "rpicam"
     camera: int = Field(default=0, ge=0)
     codec: Literal["mjpeg", "yuv420"] = "mjpeg"
     program: str | None = None
     options: tuple[str, ...] = ()
-
-    @model_validator(mode="after")
-    def _check_raw_size(self) -> RpicamSettings:
-        if self.codec == "yuv420" and (self.width % _ROW_BYTES or self.height % 2):
-            raise ValueError(
-                f"codec yuv420 needs a width that is a multiple of {_ROW_BYTES} and an even height, found "
-                f"{self.width}x{self.height}; use codec mjpeg"
-            )
-        return self
 
     def make_device(self) -> Rpicam:
         """Build the driver."""

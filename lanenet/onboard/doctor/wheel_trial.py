@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 import re
 import threading
 import time
@@ -15,7 +16,7 @@ from lanenet.config import parse_yaml
 from lanenet.errors import ConfigError, LanenetError
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
-from lanenet.onboard.actuators.pulses import PulseSettings
+from lanenet.onboard.actuators.pulses import MOST_TRIM, PulseSettings
 from lanenet.onboard.drive import DriveSettings
 from lanenet.onboard.guard import CommandSink
 
@@ -30,7 +31,7 @@ _REPEAT_S = 0.03
 _SIDE_SHARE = 0.7
 #: Half a degree, about what an eye sees at a wheel.
 _TRIM_STEP_RAD = 0.01
-#: Limit of ``steering_trim_rad``, 17 degrees.
+#: Limit of ``steering_trim_rad``.
 _MAX_TRIM_RAD = 0.3
 #: Chosen: a fifth of the default ``throttle_at_rest``.
 _THROTTLE_STEP = 0.02
@@ -150,14 +151,16 @@ class _Trial:
         """Move the wheels in small steps until they are straight; ``sign`` as of :meth:`sides`."""
         before_rad = self._pulses.steering_trim_rad
         turn_rad = 0.0
+        most_rad = min(_MAX_TRIM_RAD, MOST_TRIM * self._pulses.max_steering_rad)
         while True:
             self._holder.hold(sign * turn_rad, 0.0)
             answer = self._ask("Where do the front wheels point now: left, right, or straight ahead?", "lrs")
             if answer == "s":
                 break
             turn_rad += _TRIM_STEP_RAD if answer == "r" else -_TRIM_STEP_RAD
-            if abs(sign * before_rad + turn_rad) > _MAX_TRIM_RAD:
-                self.result.lines.append("trim: more than 17 degrees would be needed; refit the servo's horn")
+            if abs(sign * before_rad + turn_rad) > most_rad:
+                most = f"{math.degrees(most_rad):.0f} degrees"
+                self.result.lines.append(f"trim: more than {most} would be needed; refit the servo's horn")
                 return
         trim_rad = round(sign * before_rad + turn_rad, 4)
         if trim_rad != before_rad:

@@ -354,7 +354,7 @@ def test_neither_program_is_there(monkeypatch):
 
 
 def test_raw_images_need_a_width_without_padding():
-    with pytest.raises(ConfigError, match=r"multiple of 64.*found 160x120"):
+    with pytest.raises(ConfigError, match=r"width=160 and height=120: .*multiple of 64"):
         check_settings(RpicamSettings, {"codec": "yuv420", "width": 160, "height": 120}, "car.yaml")
 
 

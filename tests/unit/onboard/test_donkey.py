@@ -63,6 +63,8 @@ class Answers:
 def pilot():
     settings = DonkeySettings(
         detector={"kind": "hough"},
+        camera=CHECKPOINT / "camera.yaml",
+        camera_check=False,
         control=ControlSettings(
             steering=SteeringSettings(wheelbase_cm=20.0, max_steering_rad=0.4), smoothing={"enabled": False}
         ),

@@ -202,7 +202,7 @@ def test_the_owner_of_a_serial_line_is_ended(tmp_path):
 def test_bad_input_is_named(bus, car, tmp_path):
     with pytest.raises(HardwareError, match=r"/dev/i2c-1 at 0x41: no PCA9685 answers"):
         stop.stop_car(car, ["actuator.address=0x41"])
-    with pytest.raises(ConfigError, match=r"car\.yaml.*actuator\.pca9685\.steering_left"):
+    with pytest.raises(ConfigError, match=r"car\.yaml.*actuator\.steering_left'.*steering_left_us"):
         stop.stop_car(car, ["actuator.steering_left=3"])
     car.write_text("camera: nowhere.yaml\n")
     with pytest.raises(ConfigError, match=r"car\.yaml: key 'actuator'"):
