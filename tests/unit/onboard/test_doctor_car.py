@@ -4,6 +4,7 @@ import math
 import time
 from pathlib import Path
 
+import fake_picamera2
 import i2c_emulator
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 from lanenet.cli.app import app
 from lanenet.config import check_settings
 from lanenet.data.drives.folder import DriveWriter
-from lanenet.errors import HardwareError
+from lanenet.errors import HardwareError, LanenetError
 from lanenet.onboard.bench import example_camera
 from lanenet.onboard.devices import Frame
 from lanenet.onboard.doctor import car as doctor_car
@@ -36,9 +37,9 @@ CHECKPOINT = ROOT / "checkpoints" / "small"
 class Camera:
     """A source of even frames, ``late_s`` old when they come."""
 
-    def __init__(self, rate_hz=50.0, size=(240, 320), late_s=0.01, value=100, missing=False):
+    def __init__(self, rate_hz=50.0, size=(240, 320), late_s=0.01, value=100, missing=False, age_known=True):
         self.rate_hz, self.size, self.late_s, self.value, self.missing = rate_hz, size, late_s, value, missing
-        self.number, self.closed = 0, False
+        self.number, self.closed, self.age_known = 0, False, age_known
 
     def open(self):
         if self.missing:
@@ -51,7 +52,7 @@ class Camera:
         time.sleep(1.0 / self.rate_hz)
         self.number += 1
         image = np.full((*self.size, 3), self.value, np.uint8)
-        return Frame(image, time.monotonic() - self.late_s, self.number)
+        return Frame(image, time.monotonic() - self.late_s, self.number, self.age_known)
 
     def close(self):
         self.closed = True
@@ -81,15 +82,31 @@ def test_good_camera():
         (Camera(rate_hz=10.0), "camera", "problem", "40 were requested"),
         (Camera(size=(120, 160)), "image size", "problem", "160x120 px, but the camera file is for 320x240"),
         (Camera(late_s=0.2), "delay", "note", "200 ms"),
+        (
+            Camera(age_known=False),
+            "delay",
+            "note",
+            "age of the frames unknown: measure it with lanenet doctor",
+        ),
         (Camera(value=3), "image", "note", "is the lens covered"),
         (Camera(rate_hz=1.0), "camera", "problem", "expected a stream"),
     ],
-    ids=["missing", "slow", "size", "late", "dark", "no stream"],
+    ids=["missing", "slow", "size", "late", "no age", "dark", "no stream"],
 )
 def test_what_is_wrong_with_a_camera(source, name, state, text):
     found = {check.name: check for check in check_source(source, 40.0, example_camera())[0]}
     assert found[name].state == state and text in found[name].text
     assert source.closed
+
+
+def test_picamera2_that_is_too_old_is_a_line_and_not_a_traceback(monkeypatch, car, bus):
+    fake_picamera2.install(monkeypatch).old = True
+    text = car.read_text().replace("kind: replay", "kind: picamera2").replace("  loop: true\n", "")
+    car.write_text("".join(line for line in text.splitlines(True) if "path: " not in line))
+    done = CliRunner().invoke(app, ["doctor", "--config", str(car)])
+    assert isinstance(done.exception, SystemExit | LanenetError), done.output
+    (line,) = [line for line in done.output.splitlines() if "picamera2 is too old" in line]
+    assert line.startswith("problem camera:") and "sudo apt upgrade" in line
 
 
 @pytest.mark.parametrize(
@@ -227,6 +244,24 @@ def test_answers_are_written_into_the_file(car, monkeypatch):
     }
     assert data["control"]["speed"]["throttle_at_rest"] == 0.04
     assert done.output.count("wrote") == 1
+
+
+def test_answers_that_rule_out_the_cruise_speed_are_told_with_what_to_write(car, monkeypatch):
+    from lanenet.onboard import drive
+
+    class Sink:
+        def open(self):
+            pass
+
+        send = idle = neutral = close = lambda self, *values: None
+
+    monkeypatch.setattr(drive, "build_sink", lambda settings: Sink())
+    # Left is left, straight is straight; the wheels turn at the thirteenth step, a throttle of 0.26.
+    answers = "y\nl\ns\n" + 12 * "n\n" + "f\n"
+    done = CliRunner().invoke(app, ["doctor", "--config", str(car), "--wheels-off-ground"], input=answers)
+    assert done.exit_code == 1 and "wrote" in done.output
+    assert yaml.safe_load(car.read_text())["control"]["speed"]["throttle_at_rest"] == 0.26
+    assert "control.speed.cruise_cm_s at most 56 cm/s, or limits.max_throttle at least 0.41" in done.stderr
 
 
 @pytest.mark.parametrize(
