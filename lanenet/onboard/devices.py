@@ -19,14 +19,15 @@ class Frame:
 
     Attributes:
         image_bgr: The image; the source does not change it any more.
-        t_s: Time of exposure on the clock of :func:`time.monotonic`: the sensor's if the driver gives it,
-            else the time of arrival.
+        t_s: Time of exposure on the clock of :func:`time.monotonic`; the time of arrival if that is unknown.
         number: Counts all frames of the source, also those that were not read.
+        age_known: Whether ``t_s`` is the time of exposure.
     """
 
     image_bgr: UInt8[np.ndarray, "h w 3"] = field(repr=False)
     t_s: float
     number: int
+    age_known: bool = True
 
 
 @runtime_checkable

@@ -45,7 +45,7 @@ from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.drive import DriveDetectorSettings
-from lanenet.onboard.frame_check import same_image
+from lanenet.onboard.frame_check import RepeatCheck
 from lanenet.onboard.rules import PILOT_RULES
 from lanenet.onboard.safety import CommandLimiter, LimitSettings
 from lanenet.perception.camera_check import CameraCheck, Concern, Finding
@@ -74,9 +74,9 @@ class DonkeySettings(Settings):
         min_confidence: A frame with less confidence counts as one without a lane.
         hold_s: Without a lane, or without a new image, the car keeps its last command for this long, then
             stops. Must be longer than the time between two images.
-        allow_repeated_frames: Treat an image that equals the one before in every pixel as a new one.
-            Donkeycar repeats the last image of a camera that hangs; a simulator without noise gives equal
-            images while the car stands.
+        allow_repeated_frames: Treat an image that repeats an earlier one as a new one. Donkeycar repeats the
+            last image of a camera that hangs; a simulator without noise gives equal images while the car
+            stands.
         camera_check: Compare what the driving car sees with the camera file; slow down to half the speed, and
             stop, when the camera seems to have moved. It starts anew when a person has driven.
     """
@@ -139,7 +139,7 @@ class LanePilot:
         self._finding = Finding()
         self._limiter = CommandLimiter(settings.limits)
         self._clock = clock
-        self._before: UInt8[np.ndarray, "h w 3"] | None = None
+        self._repeats = RepeatCheck()
         self._run_s = self._seen_s = -math.inf
         self._target = (0.0, 0.0)
 
@@ -177,7 +177,7 @@ class LanePilot:
         else:
             # A copy, since some of Donkeycar's cameras reuse one array.
             bgr = _bgr_of(image_rgb)
-            if self._is_new(bgr):
+            if self._settings.allow_repeated_frames or not self._repeats.fault_of(bgr):
                 motion = self._target[1], self._limiter.steering_rad
                 self._controller.tell(self._detector, now_s, *motion)
                 self.estimate = self._detector.detect(bgr)
@@ -190,12 +190,6 @@ class LanePilot:
         steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
         # Donkeycar's sign: -1 is left.
         return -steering_rad / self._settings.limits.max_steering_rad, throttle
-
-    def _is_new(self, bgr: UInt8[np.ndarray, "h w 3"]) -> bool:
-        before, self._before = self._before, bgr
-        if self._settings.allow_repeated_frames or before is None:
-            return True
-        return not same_image(before, bgr)
 
     def _follow(self, now_s: float) -> None:
         target = self._controller.target(self.estimate, now_s, self._target[1], self._limiter.steering_rad)

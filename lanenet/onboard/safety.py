@@ -49,7 +49,7 @@ class SafetySettings(Settings):
         stop_below: Below this confidence the car stops.
         slow_for_s: A car that has been slow for this long stops.
         end_after_s: If an armed car had to stop for this long, the drive ends: it does not start again.
-        allow_repeated_frames: Accept a frame that equals the one before in every pixel. A camera sends such
+        allow_repeated_frames: Accept a frame that repeats an earlier one, or its road. A camera sends such
             frames only when it hangs; a simulator without noise sends them while the car stands.
         camera_check: Compare what the driving car sees with the camera file; warn, slow down and stop when
             the camera seems to have moved.

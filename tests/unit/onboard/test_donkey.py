@@ -182,6 +182,25 @@ def test_camera_that_hangs_stops_the_car_after_its_time(pilot):
     assert pilot.run(image)[1] > 0.0
 
 
+@pytest.mark.parametrize("changes", ["buffers in rotation", "upper rows", "clock"])
+def test_camera_that_hangs_in_part_stops_the_car(pilot, changes):
+    pilot = pilot_of(pilot._settings.model_copy(update={"allow_repeated_frames": False}))
+    pilot._detector.estimate = lane(-5.0)
+    rng = np.random.default_rng(4)
+    held = [rng.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(3)]
+    assert all(pilot.run(image)[1] > 0.0 for image in held)
+    throttles = []
+    for k in range(9):
+        image = held[k % 3].copy()
+        if changes == "upper rows":
+            image[:40] = rng.integers(0, 255, (40, 160, 3))
+        elif changes == "clock":
+            image[100:110, 10:70] = 20 * k
+        throttles.append(pilot.run(image)[1])
+    # It holds its last command for 0.12 s, at 20 images per second.
+    assert max(throttles[2:]) == 0.0
+
+
 def test_throttle_rises_from_zero_after_a_person_drove(pilot):
     limits = pilot._settings.limits.model_copy(update={"throttle_rate_s": 1.0})
     pilot = pilot_of(pilot._settings.model_copy(update={"limits": limits}))
