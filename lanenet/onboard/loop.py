@@ -228,6 +228,7 @@ class DriveLoop:
             self._until_s = min(now_s + self._safety.watchdog_s, frame.t_s + self._safety.max_age_s)
             self._send(*command, self._until_s)
             self.report.work.add(self._clock() - begin_s)
+            self.report.age_known &= frame.age_known
             self.report.latency.add(self._clock() - frame.t_s)
         elif now_s < self._until_s and verdict.state is not State.ENDED:
             # The last command is still valid: a bad frame does no harm yet.
@@ -448,7 +449,8 @@ class DriveReport:
     Attributes:
         frames: Frames that were processed.
         skipped: Frames of the source that were not read because the loop was late.
-        latency: From the exposure of a frame to its command.
+        latency: From the exposure of a frame to its command; from its arrival where that is not known.
+        age_known: Whether the time of exposure was known of all frames.
         work: From having the frame to its command.
         states: Turns of the loop in each state.
         seconds: Time from the first turn to the last.
@@ -459,6 +461,7 @@ class DriveReport:
         unrecorded: Frames left out because the card was slow or the recording had stopped.
     """
 
+    age_known: bool = True
     frames: int = 0
     skipped: int = 0
     latency: LatencyHistogram = field(default_factory=LatencyHistogram)
@@ -492,7 +495,8 @@ class DriveReport:
         if len(self.work):
             lines.append(
                 f"frame to command {self.work.percentile_ms(50.0):.2f} ms (median), "
-                f"{self.work.percentile_ms(99.0):.2f} ms (p99); exposure to command "
+                f"{self.work.percentile_ms(99.0):.2f} ms (p99); "
+                f"{'exposure' if self.age_known else 'age unknown, arrival'} to command "
                 f"{self.latency.percentile_ms(50.0):.1f} ms, {self.latency.percentile_ms(99.0):.1f} ms"
             )
         lines.append(f"states: {shares}")

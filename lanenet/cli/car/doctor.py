@@ -28,16 +28,27 @@ def doctor(
             help="Turn wheels and motor, ask what they did, and write the answers into --config.",
         ),
     ] = False,
+    camera_delay: Annotated[
+        bool,
+        typer.Option(
+            "--camera-delay",
+            help="Measure the delay of the camera of --config: cover and uncover its lens when asked.",
+        ),
+    ] = False,
 ) -> None:
     """Check the installation, a camera file if one is given, and a whole car with --config."""
     from lanenet.onboard.doctor.installation import run_checks
     from lanenet.onboard.drive import load_drive_settings
 
     settings = None if config is None else load_drive_settings(config)
-    if wheels_off_ground:
+    if wheels_off_ground or camera_delay:
         if config is None or settings is None:
-            raise ConfigError("--wheels-off-ground: needs the car's file as well (--config car.yaml)")
-        _try_wheels(config, settings)
+            option = "--wheels-off-ground" if wheels_off_ground else "--camera-delay"
+            raise ConfigError(f"{option}: needs the car's file as well (--config car.yaml)")
+        if camera_delay:
+            _measure_delay(config, settings)
+        if wheels_off_ground:
+            _try_wheels(config, settings)
         return
     checks = run_checks(camera)
     if settings is not None:
@@ -58,6 +69,21 @@ def doctor(
         console.next_command("drive", config, "--dry-run")
     else:
         console.next_command("doctor", "--config", config, "--wheels-off-ground")
+
+
+def _measure_delay(config: Path, settings: DriveSettings) -> None:
+    """Ask a person to cover and uncover the lens, and show the camera's delay."""
+    from lanenet.onboard.cameras import open_source
+    from lanenet.onboard.doctor.camera_delay import measure_delay
+
+    if settings.source.kind == "replay":
+        raise ConfigError(f"--camera-delay: {config}: the source is a recording, expected a camera")
+
+    def ask(question: str) -> None:
+        typer.prompt(question, default="", show_default=False, prompt_suffix=" ")
+
+    console.show_lines(measure_delay(open_source(settings.source), ask).lines)
+    console.next_command("doctor", "--config", config)
 
 
 def _try_wheels(config: Path, settings: DriveSettings) -> None:

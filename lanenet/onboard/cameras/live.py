@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from pydantic import Field
 
 from lanenet.config import Rule, Settings
-from lanenet.errors import HardwareError
+from lanenet.errors import HardwareError, LanenetError
 from lanenet.onboard.devices import Frame, FrameSource
 
 _log = logging.getLogger(__name__)
@@ -29,8 +29,9 @@ _GRAB_S = 0.1
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.2, 5.0
 #: Closing waits no longer than this for a driver that hangs.
 _JOIN_S = 3.0
-#: If all exposure times of a device are older than this, they are from another clock.
-_OLDEST_S = 1.0
+#: A first time of exposure further ahead, or older, is from another clock; chosen: more than rounding, and
+#: more than any driver has buffers for.
+_MAX_AHEAD_S, _MAX_OLD_S = 0.05, 60.0
 
 
 def _longer_than_a_frame(key: str) -> Rule:
@@ -54,6 +55,9 @@ class CameraSettings(Settings):
         start_s: The longest wait for the first frame.
         silence_s: A camera that sends no frame for this long counts as lost.
         give_up_s: For how long a lost camera is restarted.
+        delay_s: Time from the exposure of a frame to its arrival, as ``lanenet doctor --camera-delay``
+            measures it, in place of the driver's times. None: the driver's times; without them the age of a
+            frame is unknown.
     """
 
     rules: ClassVar[tuple[Rule, ...]] = (_longer_than_a_frame("start_s"), _longer_than_a_frame("silence_s"))
@@ -65,6 +69,7 @@ class CameraSettings(Settings):
     start_s: float = Field(default=5.0, gt=0.0)
     silence_s: float = Field(default=1.0, gt=0.0)
     give_up_s: float = Field(default=60.0, ge=0.0)
+    delay_s: float | None = Field(default=None, ge=0.0, le=10.0)
 
     def make_device(self) -> Device:
         """Build the camera's driver; the camera is not touched before ``start``."""
@@ -81,7 +86,8 @@ class Capture:
 
     Attributes:
         image_bgr: The image; the device does not change it any more.
-        t_s: Time of exposure on the clock of :func:`time.monotonic`; None if the device does not give it.
+        t_s: Time of exposure; a device that gives it declares that it is on the clock of
+            :func:`time.monotonic`. None if it has no such clock: the age of the image is unknown.
         skipped: Older images that the device dropped since the last one.
     """
 
@@ -123,8 +129,10 @@ class LiveSource:
         self._newest: Frame | None = None
         self._returned = -1
         self._count = 0
+        #: Whether the device's times are on the clock of time.monotonic; None until it gives one.
+        self._has_clock: bool | None = None
+        self._warned = False
         self._failure: HardwareError | None = None
-        self._clock_agrees = False
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -132,7 +140,8 @@ class LiveSource:
         """Start the camera and wait for its first frame; see :class:`lanenet.onboard.devices.FrameSource`.
 
         Raises:
-            HardwareError: If the camera is not there, sends nothing, or sends images of another size.
+            HardwareError: If the camera is not there, sends nothing or what cannot be used, or if its driver
+                raises anything else.
             MissingExtraError: If its driver is not installed.
         """
         if self._thread is not None:
@@ -149,9 +158,14 @@ class LiveSource:
                         "seated, and does another program use it?"
                     )
                 self._take(self._device.grab(_GRAB_S))
-        except Exception:
+        except BaseException as error:
             self._device.stop()
-            raise
+            if isinstance(error, LanenetError) or not isinstance(error, Exception):
+                raise
+            raise HardwareError(
+                f"{self._device.name}: its driver fails at the first frame ({type(error).__name__}: "
+                f"{error}); is its cable seated, does another program use it, is the driver up to date?"
+            ) from error
         self._thread = threading.Thread(target=self._run, name=f"camera {self._device.name}", daemon=True)
         self._thread.start()
 
@@ -250,17 +264,29 @@ class LiveSource:
         exposed_s = self._exposed_s(capture.t_s, arrived_s)
         with self._fresh:
             self._count += 1 + capture.skipped
-            self._newest = Frame(image, exposed_s, self._count - 1)
+            t_s = arrived_s if exposed_s is None else exposed_s
+            self._newest = Frame(image, t_s, self._count - 1, age_known=exposed_s is not None)
             self._fresh.notify_all()
         return True
 
-    def _exposed_s(self, stamp_s: float | None, arrived_s: float) -> float:
-        """Return the time of exposure: the device's if it can be used, else the time of arrival."""
-        if stamp_s is None or not stamp_s <= arrived_s:
-            return arrived_s
-        # Once the clocks have agreed, an old time means an old image, which must not be used.
-        self._clock_agrees = self._clock_agrees or arrived_s - stamp_s < _OLDEST_S
-        return stamp_s if self._clock_agrees else arrived_s
+    def _exposed_s(self, stamp_s: float | None, arrived_s: float) -> float | None:
+        """Return the time of exposure; None if it is unknown."""
+        if self._settings.delay_s is not None:
+            return arrived_s - self._settings.delay_s
+        why = "its driver gives no time of exposure"
+        if self._has_clock is None and stamp_s is not None:
+            # Only the first time is judged: whatever is old later, is.
+            self._has_clock = -_MAX_AHEAD_S <= arrived_s - stamp_s <= _MAX_OLD_S
+            why = f"its driver has another clock, {arrived_s - stamp_s:.2f} s behind time.monotonic"
+        exposed_s = stamp_s if self._has_clock else None
+        if exposed_s is None and not self._warned:
+            self._warned = True
+            _log.warning(
+                "%s: the age of its frames is unknown: %s. Only their arrival is watched; measure their "
+                "delay with lanenet doctor --config CAR.yaml --camera-delay",
+                self._device.name, why,
+            )  # fmt: skip
+        return exposed_s
 
 
 def stop_quietly(*actions: Callable[[], object]) -> None:

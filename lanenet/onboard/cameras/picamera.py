@@ -93,6 +93,12 @@ class PiCamera:
         except TimeoutError:
             # Keep the job: new ones would pile up in the driver.
             return None
+        except TypeError as error:
+            # Until 0.3.16 a job could not be waited for with a limit.
+            raise HardwareError(
+                f"{self.name}: picamera2 is too old, expected 0.3.17 or later ({error}): sudo apt update, "
+                "then sudo apt upgrade"
+            ) from None
         self._job = None
         try:
             image = to_bgr(request.make_array("main"), self._order)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import shutil
 import subprocess
@@ -12,10 +13,12 @@ from typing import IO, ClassVar, Literal
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 from pydantic import Field
 
 from lanenet.config import Rule
 from lanenet.errors import HardwareError
+from lanenet.onboard.cameras.jpeg import decode_jpeg
 from lanenet.onboard.cameras.live import CameraSettings, Capture, stop_quietly
 
 #: The program's name since Raspberry Pi OS Bookworm, and before.
@@ -24,6 +27,11 @@ _PROGRAMS = ("rpicam-vid", "libcamera-vid")
 _ROW_BYTES = 64
 #: Time for the program to end by itself.
 _STOP_S = 1.0
+#: The program writes the time of an image right after the image. Longest wait for it, chosen: as long as a
+#: frame may be old.
+_STAMP_S = 0.1
+#: A time of exposure in the program's lines, [ns].
+_STAMP = re.compile(rb"^SensorTimestamp=(\d+)$", re.MULTILINE)
 #: JPEG markers: start and end of image, start of scan.
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 #: JPEG markers without a length: TEM and RST0 to RST7.
@@ -40,6 +48,8 @@ class RpicamSettings(CameraSettings):
             that is a multiple of 64.
         program: The program; None tries rpicam-vid, then libcamera-vid.
         options: More arguments for it, for example ``[--shutter, "8000"]``.
+        metadata: Let the program write the time of exposure of each frame (its ``--metadata``, since
+            September 2022); without, the age of a frame is unknown.
     """
 
     rules: ClassVar[tuple[Rule, ...]] = (
@@ -59,6 +69,7 @@ class RpicamSettings(CameraSettings):
     codec: Literal["mjpeg", "yuv420"] = "mjpeg"
     program: str | None = None
     options: tuple[str, ...] = ()
+    metadata: bool = True
 
     def make_device(self) -> Rpicam:
         """Build the driver."""
@@ -75,6 +86,9 @@ class Rpicam:
         self._stderr: IO[bytes] | None = None
         self._jpegs = JpegStream()
         self._raw = bytearray()
+        #: Images that were complete since the start.
+        self._seen = 0
+        self._stamps: Stamps | None = None
 
     def start(self) -> None:
         """Start the program; see :class:`lanenet.onboard.cameras.live.Device`."""
@@ -88,16 +102,27 @@ class Rpicam:
         words += ["--camera", str(settings.camera), "--codec", settings.codec]
         words += ["--width", str(settings.width), "--height", str(settings.height)]
         words += ["--framerate", f"{settings.rate_hz:g}", *settings.options]
-        self._jpegs, self._raw = JpegStream(), bytearray()
+        self._jpegs, self._raw, self._seen = JpegStream(), bytearray(), 0
         # A file, not a pipe: the program can write any amount without being read.
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (stop closes it)
+        stamps = Stamps() if settings.metadata else None
+        self._stamps = stamps
+        if stamps is not None:
+            words += ["--metadata", f"/dev/fd/{stamps.write_end}", "--metadata-format", "txt"]
         try:
             self._process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=self._stderr
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=self._stderr,
+                pass_fds=() if stamps is None else (stamps.write_end,),
             )
         except OSError as error:
             self.stop()
             raise HardwareError(f"{self.name}: {program} cannot be run ({error.strerror})") from None
+        finally:
+            if stamps is not None:
+                os.close(stamps.write_end)
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
 
@@ -113,14 +138,21 @@ class Rpicam:
             data = self._read_all(pipe)
             if not data:
                 raise HardwareError(f"{self.name}: the program ended{self._last_line()}")
-            capture = self._newest_jpeg(data) if self._settings.codec == "mjpeg" else self._newest_raw(data)
-            if capture is not None:
-                return capture
+            images = self._split(data)
+            self._seen += len(images)
+            for newer, encoded in enumerate(reversed(images)):
+                # Of a broken image the one before is taken.
+                if (image := self._decode(encoded)) is not None:
+                    exposed_s = self._exposed_s(self._seen - 1 - newer)
+                    return Capture(image, exposed_s, skipped=len(images) - 1 - newer)
 
     def stop(self) -> None:
         """End the program; see ``Device``."""
         process, self._process = self._process, None
         stderr, self._stderr = self._stderr, None
+        stamps, self._stamps = self._stamps, None
+        if stamps is not None:
+            stamps.close()
         if process is not None:
             assert process.stdout is not None
             stop_quietly(process.stdout.close, process.terminate)
@@ -145,26 +177,33 @@ class Rpicam:
             parts.append(part)
         return b"".join(parts)
 
-    def _newest_jpeg(self, data: bytes) -> Capture | None:
-        images = self._jpegs.feed(data)
-        for skipped, jpeg in enumerate(reversed(images)):
-            # OpenCV returns None for a broken image: then take the one before.
-            image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-            if image is not None:
-                return Capture(np.asarray(image), skipped=len(images) - 1 - skipped)
-        return None
-
-    def _newest_raw(self, data: bytes) -> Capture | None:
+    def _split(self, data: bytes) -> list[bytes]:
+        """Return the images that are complete with these bytes, oldest first."""
+        if self._settings.codec == "mjpeg":
+            return self._jpegs.feed(data)
         self._raw += data
-        width, height = self._settings.width, self._settings.height
-        size = width * height * 3 // 2
+        size = self._settings.width * self._settings.height * 3 // 2
         count = len(self._raw) // size
-        if count == 0:
-            return None
-        planes = np.frombuffer(bytes(self._raw[(count - 1) * size : count * size]), np.uint8)
+        images = [bytes(self._raw[k * size : (k + 1) * size]) for k in range(count)]
         del self._raw[: count * size]
-        image = cv2.cvtColor(planes.reshape(height * 3 // 2, width), cv2.COLOR_YUV2BGR_I420)
-        return Capture(np.asarray(image), skipped=count - 1)
+        return images
+
+    def _decode(self, data: bytes) -> UInt8[np.ndarray, "h w 3"] | None:
+        if self._settings.codec == "mjpeg":
+            return decode_jpeg(data)
+        planes = np.frombuffer(data, np.uint8).reshape(-1, self._settings.width)
+        return np.asarray(cv2.cvtColor(planes, cv2.COLOR_YUV2BGR_I420))
+
+    def _exposed_s(self, number: int) -> float | None:
+        """Return the time of exposure of an image, counted from the start; None if it is unknown."""
+        if self._stamps is None:
+            return None
+        stamp_s = self._stamps.of(number, _STAMP_S)
+        if stamp_s is None:
+            # Those that follow could belong to any frame.
+            self._stamps.close()
+            self._stamps = None
+        return stamp_s
 
     def _last_line(self) -> str:
         if self._stderr is None:
@@ -173,6 +212,41 @@ class Rpicam:
         lines = self._stderr.read()[-2000:].decode("utf-8", errors="replace").split("\n")
         lines = [line.strip() for line in lines if line.strip()]
         return f": {lines[-1]}" if lines else ""
+
+
+class Stamps:
+    """Times of exposure as rpicam-vid writes them into a pipe, one for each image."""
+
+    def __init__(self) -> None:
+        """Open the pipe; ``write_end`` is for the program."""
+        self._read_end, self.write_end = os.pipe()
+        self._data = b""
+        #: Times that were not returned yet, and the number of the first one's image.
+        self._times_s: list[float] = []
+        self._first = 0
+
+    def of(self, number: int, timeout_s: float) -> float | None:
+        """Return the time of an image, on the clock of :func:`time.monotonic`; None if it does not come.
+
+        Args:
+            number: Of the image, not smaller than in the call before.
+            timeout_s: The longest wait, [s].
+        """
+        end_s = time.monotonic() + timeout_s
+        while number >= self._first + len(self._times_s):
+            ready, _, _ = select.select([self._read_end], [], [], max(0.0, end_s - time.monotonic()))
+            data = os.read(self._read_end, 1 << 16) if ready else b""
+            if not data:
+                return None
+            lines, _, self._data = (self._data + data).rpartition(b"\n")
+            self._times_s += [1e-9 * int(stamp) for stamp in _STAMP.findall(lines)]
+        del self._times_s[: number - self._first]
+        self._first = number
+        return self._times_s[0]
+
+    def close(self) -> None:
+        """Close the pipe."""
+        os.close(self._read_end)
 
 
 class JpegStream:

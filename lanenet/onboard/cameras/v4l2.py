@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from lanenet.errors import HardwareError
+from lanenet.onboard.cameras.jpeg import decode_jpeg
 from lanenet.onboard.cameras.live import CameraSettings, Capture, stop_quietly
 
 
@@ -55,17 +56,28 @@ class V4L2Camera:
         capture.set(cv2.CAP_PROP_FPS, settings.rate_hz)
         # Queued frames would only be late.
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        if settings.fourcc == "MJPG":
+            # As they came: OpenCV would show images that lost bytes, too.
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
 
     def grab(self, timeout_s: float) -> Capture | None:
-        """Return the next frame; OpenCV decides how long to wait. See ``Device``."""
+        """Return the next frame, None if it lost bytes; OpenCV decides how long to wait. See ``Device``."""
         ok, image = self._capture.read()
         if not ok or image is None:
             raise HardwareError(f"{self.name}: sends no frame; was it unplugged?")
-        # The driver's time of the buffer, which Linux takes from the monotonic clock.
-        stamp_ms = float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
-        return Capture(
-            np.asarray(image), 1e-3 * stamp_ms if 0.0 < stamp_ms <= 1e3 * time.monotonic() else None
-        )
+        # The driver's time of the buffer, which Linux takes from the monotonic clock. Some drivers give none,
+        # and some the time of day, which is far ahead.
+        stamp_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        image = np.asarray(image)
+        if image.ndim == 1 or 1 in image.shape[:2]:
+            image = decode_jpeg(image.tobytes())
+        elif image.shape[2:] != (3,):
+            # Another format than was requested: OpenCV knows how to convert it.
+            self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 1)
+            return None
+        if image is None:
+            return None
+        return Capture(image, stamp_s if 0.0 < stamp_s <= time.monotonic() else None)
 
     def stop(self) -> None:
         """Release the device; see ``Device``."""

@@ -101,9 +101,7 @@ def check_source(
         checks.append(Check("image size", "problem", f"{text}: set width and height, or calibrate again"))
     else:
         checks.append(Check("image size", "ok", f"{width}x{height} px"))
-    late_ms = 1e3 * float(np.median([a - f.t_s for f, a in zip(frames, arrived_s, strict=True)]))
-    state: State = "note" if late_ms > _LATE_MS else "ok"
-    checks.append(Check("delay", state, f"{late_ms:.0f} ms from exposure, by the driver, to here"))
+    checks.append(_delay(frames, arrived_s))
     brightness = float(np.mean([f.image_bgr.mean() for f in frames[-5:]]))
     if not _DARK <= brightness <= _BRIGHT:
         text = f"mean brightness {brightness:.0f} of 255: is the lens covered, the room dark?"
@@ -200,6 +198,15 @@ def _rate(frames: list[Frame], wanted_hz: float | None) -> Check:
         )
         return Check("camera", "problem", text)
     return Check("camera", "ok", text)
+
+
+def _delay(frames: list[Frame], arrived_s: list[float]) -> Check:
+    if not all(frame.age_known for frame in frames):
+        text = "age of the frames unknown: measure it with lanenet doctor --config CAR.yaml --camera-delay"
+        return Check("delay", "note", text)
+    late_ms = 1e3 * float(np.median([a - f.t_s for f, a in zip(frames, arrived_s, strict=True)]))
+    state: State = "note" if late_ms > _LATE_MS else "ok"
+    return Check("delay", state, f"{late_ms:.0f} ms from exposure, by the driver or source.delay_s, to here")
 
 
 def _fit(frames: Sequence[Frame], camera: Camera) -> bool:

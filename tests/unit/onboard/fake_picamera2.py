@@ -46,6 +46,13 @@ class Job:
         return self.future.result(timeout)
 
 
+class OldJob(Job):
+    """Of picamera2 0.3.12 to 0.3.16: nobody can wait for it with a limit (its change log, 0.3.17)."""
+
+    def get_result(self):
+        return self.future.result()
+
+
 class Camera:
     def __init__(self, world, number):
         if number >= world.cameras:
@@ -82,7 +89,7 @@ class Camera:
 
     def capture_request(self, wait=None):
         assert wait is False
-        job = Job()
+        job = OldJob() if self.world.old else Job()
         self.world.most_jobs = max(self.world.most_jobs, len(self.jobs) + 1)
         self.jobs.append(job)
         return job
@@ -100,7 +107,7 @@ class World:
 
     def __init__(self):
         self.cameras, self.opened, self.held, self.most_jobs = 1, 0, 0, 0
-        self.lost = False
+        self.lost = self.old = False
         self.stamps, self.age_ns = True, 12_000_000
         self.forced_format = None
 

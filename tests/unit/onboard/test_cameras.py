@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import os
 import stat
 import sys
 import threading
 import time
+from pathlib import Path
 
 import cv2
 import fake_picamera2
@@ -19,6 +21,7 @@ from lanenet.onboard.cameras.rpicam import RpicamSettings
 from lanenet.onboard.cameras.v4l2 import V4L2Settings
 from lanenet.onboard.devices import FrameSource
 
+ROOT = Path(__file__).resolve().parents[3]
 SMALL = {"width": 64, "height": 48, "rate_hz": 100.0}
 
 
@@ -164,6 +167,33 @@ def test_open_refuses_what_does_not_work(device):
         LiveSource(device, settings).read(0.0)
 
 
+@pytest.mark.parametrize("where", ["start", "grab"])
+@pytest.mark.parametrize(
+    "raised", [RuntimeError("busy"), TypeError("no timeout"), OSError(5, "lost"), KeyError()]
+)
+def test_whatever_a_driver_raises_at_the_first_frame_is_one_line(device, where, raised):
+    def fails(*_):
+        raise raised
+
+    setattr(device, where, fails)
+    source = LiveSource(device, CameraSettings(width=64, height=48))
+    with pytest.raises(HardwareError) as caught:
+        source.open()
+    assert str(caught.value).startswith("fake camera: its driver fails at the first frame")
+    assert type(raised).__name__ in str(caught.value) and "\n" not in str(caught.value)
+    assert device.stops == 1
+
+
+def test_a_first_frame_that_is_interrupted_is_not_the_cameras_fault(device):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    device.grab = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        LiveSource(device, CameraSettings(width=64, height=48)).open()
+    assert device.stops == 1
+
+
 def test_turned_image(device):
     source = LiveSource(device, CameraSettings(width=64, height=48, rotate_180=True))
     source.open()
@@ -247,6 +277,13 @@ def test_time_of_another_clock_is_not_used(pi):
     source.close()
 
 
+def test_picamera2_that_is_too_old_says_so(pi):
+    pi.old = True
+    with pytest.raises(HardwareError, match=r"picamera2 is too old, expected 0\.3\.17.*sudo apt upgrade"):
+        open_source(PiCameraSettings(**SMALL)).open()
+    assert pi.opened == 0
+
+
 def test_late_camera_gets_no_pile_of_jobs(pi):
     settings = PiCameraSettings(silence_s=1.0, **SMALL)
     source = open_source(settings)
@@ -284,6 +321,8 @@ import sys, time
 import cv2, numpy as np
 def option(name):
     return sys.argv[sys.argv.index(name) + 1]
+late_s = {late_s!r}
+stamps = open(option("--metadata"), "w") if late_s is not None else None
 open({log!r}, "a").write(" ".join(sys.argv[1:]) + "\\n")
 w, h = int(option("--width")), int(option("--height"))
 if option("--camera") == "5":
@@ -294,19 +333,24 @@ for value in range({count}):
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
     else:
         data = cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420).tobytes()
+    exposed_ns = 0 if late_s is None else time.monotonic_ns() - int(1e9 * late_s)
     # The pipe is filled in pieces that know nothing of images.
     for piece in (data[:100], data[100:101], data[101:]):
         sys.stdout.buffer.write(piece)
         sys.stdout.buffer.flush()
+    if stamps is not None:
+        for line in ("ExposureTime=5000", f"SensorTimestamp={{exposed_ns}}", "Lux=120.5", ""):
+            print(line, file=stamps, flush=True)
     time.sleep(1 / float(option("--framerate")))
 """
 
 
 @pytest.fixture
 def program(tmp_path):
-    def make(count=100000):
+    def make(count=100000, late_s=0.03):
         path = tmp_path / "rpicam-vid"
-        path.write_text(PROGRAM.format(python=sys.executable, log=str(tmp_path / "log"), count=count))
+        log = str(tmp_path / "log")
+        path.write_text(PROGRAM.format(python=sys.executable, log=log, count=count, late_s=late_s))
         path.chmod(path.stat().st_mode | stat.S_IXUSR)
         return str(path)
 
@@ -327,6 +371,44 @@ def test_pipe_of_rpicam_vid(program, tmp_path, codec):
     assert (blue, green, red) == pytest.approx((later.number % 200, 90, 200 - later.number % 200), abs=4)
     words = (tmp_path / "log").read_text()
     assert "--nopreview --timeout 0" in words and "--shutter 8000" in words
+
+
+@pytest.mark.parametrize("codec", ["mjpeg", "yuv420"])
+@pytest.mark.parametrize("late_s", [0.03, 1.0])
+def test_age_of_a_frame_is_what_rpicam_vid_says(program, late_s, codec):
+    source = open_source(RpicamSettings(program=program(late_s=late_s), codec=codec, **SMALL))
+    source.open()
+    for _ in range(20):
+        frame = read(source)
+        assert frame.age_known
+        # Each frame has its own time: they come every 10 ms, and some are not read.
+        assert late_s - 0.001 <= time.monotonic() - frame.t_s < late_s + 0.5
+    source.close()
+
+
+def test_without_its_metadata_the_age_is_unknown(program, caplog):
+    source = open_source(RpicamSettings(program=program(late_s=None), **SMALL))
+    source.open()
+    assert not read(source).age_known and not read(source).age_known
+    source.close()
+    assert "age of its frames is unknown: its driver gives no time of exposure" in caplog.text
+
+
+def test_a_program_that_knows_no_metadata_is_not_asked(program, tmp_path):
+    source = open_source(RpicamSettings(program=program(late_s=None), metadata=False, **SMALL))
+    source.open()
+    assert not read(source).age_known
+    source.close()
+    assert "--metadata" not in (tmp_path / "log").read_text()
+
+
+def test_pipes_are_closed(program):
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        source = open_source(RpicamSettings(program=program(), **SMALL))
+        source.open()
+        source.close()
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 def test_program_that_ends_is_started_again(program, tmp_path):
@@ -411,6 +493,49 @@ def test_usb_camera(monkeypatch):
     monkeypatch.setattr(FakeCapture, "opened", False)
     with pytest.raises(HardwareError, match="/dev/video0: cannot be opened"):
         open_source(V4L2Settings(**SMALL)).open()
+
+
+class RawCapture(FakeCapture):
+    """Gives the bytes of a JPEG image where OpenCV shall not convert; every other one lost some."""
+
+    made = 0
+
+    def read(self):
+        ok, image = super().read()
+        RawCapture.made += 1
+        image = cv2.imread(str(ROOT / "checkpoints" / "small" / "example.jpg"))
+        if self.set_values.get(cv2.CAP_PROP_CONVERT_RGB, 1):
+            return ok, image
+        if RawCapture.other:
+            return ok, np.zeros((240, 320, 2), np.uint8)
+        data = cv2.imencode(".jpg", image)[1].ravel()
+        lost = data if RawCapture.made % 2 else np.delete(data, slice(4000, 4500))
+        return ok, np.concatenate([lost, np.zeros(30, np.uint8)])[None]
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_usb_cameras_images_that_lost_bytes_are_none(monkeypatch, other):
+    monkeypatch.setattr(cv2, "VideoCapture", RawCapture)
+    monkeypatch.setattr(RawCapture, "other", other, raising=False)
+    device = V4L2Settings().make_device()
+    device.start()
+    captures = [device.grab(0.1) for _ in range(10)]
+    device.stop()
+    whole = [capture for capture in captures if capture is not None]
+    # A camera that sends another format than MJPG loses one frame, and OpenCV converts the others.
+    assert len(whole) == (9 if other else 5)
+    assert all(capture.image_bgr.shape == (240, 320, 3) and capture.image_bgr.std() > 20 for capture in whole)
+
+
+@pytest.mark.parametrize("stamp_s", [0.0, 1.7e9])
+def test_usb_camera_with_another_clock_has_none(monkeypatch, stamp_s):
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+    monkeypatch.setattr(FakeCapture, "clock", staticmethod(lambda: stamp_s + 0.02))
+    source = open_source(V4L2Settings(**SMALL))
+    source.open()
+    frame = read(source)
+    source.close()
+    assert not frame.age_known and abs(time.monotonic() - frame.t_s) < 0.5
 
 
 @pytest.mark.parametrize(
