@@ -228,8 +228,8 @@ class DriveLoop:
             self._until_s = min(now_s + self._safety.watchdog_s, frame.t_s + self._safety.max_age_s)
             self._send(*command, self._until_s)
             self.report.work.add(self._clock() - begin_s)
-            self.report.age_known &= frame.age_known
             self.report.latency.add(self._clock() - frame.t_s)
+            self.report.age_known &= frame.age_known
         elif now_s < self._until_s and verdict.state is not State.ENDED:
             # The last command is still valid: a bad frame does no harm yet.
             verdict = self._verdict
@@ -461,10 +461,10 @@ class DriveReport:
         unrecorded: Frames left out because the card was slow or the recording had stopped.
     """
 
-    age_known: bool = True
     frames: int = 0
     skipped: int = 0
     latency: LatencyHistogram = field(default_factory=LatencyHistogram)
+    age_known: bool = True
     work: LatencyHistogram = field(default_factory=LatencyHistogram)
     states: Counter[State] = field(default_factory=Counter)
     seconds: float = 0.0
