@@ -20,9 +20,13 @@ def main() -> None:
 
         raise SystemExit(stop.main(words))
     if verb == "drive":
+        from lanenet.errors import MotorMayRunError
         from lanenet.onboard import stop
 
-        stop.prepare_drive(words)
+        try:
+            stop.prepare_drive(words)
+        except MotorMayRunError as error:
+            raise SystemExit(stop.fail(error)) from None
     from lanenet.cli.app import main as command_line
 
     command_line()

@@ -12,6 +12,7 @@
     |- ModelMismatchError    a model that does not fit this camera or window
     |- MissingExtraError     a package of an extra that is not installed
     |- HardwareError         a camera or an actuator that does not answer
+       |- MotorMayRunError   neutral could be confirmed and was not
 
 A message names what was found, what was expected and where (file, key, frame).
 """
@@ -49,7 +50,13 @@ def printable(text: str) -> str:
 
 
 class LanenetError(Exception):
-    """Base of all errors of the input, shown to the user as one line."""
+    """Base of all errors of the input, shown to the user as one line.
+
+    Attributes:
+        exit_code: Of the command that ends with the error.
+    """
+
+    exit_code = 1
 
 
 class ConfigError(LanenetError):
@@ -106,3 +113,12 @@ class MissingExtraError(LanenetError):
 
 class HardwareError(LanenetError):
     """A camera or an actuator is missing, or does not answer."""
+
+
+class MotorMayRunError(HardwareError):
+    """The hardware has not confirmed neutral: a person has to disconnect the battery.
+
+    The exit code stands in ``RestartPreventExitStatus=`` of ``contrib/lanenet.service``.
+    """
+
+    exit_code = 4

@@ -54,6 +54,7 @@ class _Group(TyperGroup):
             _refuse_usage(error)
 
     def invoke(self, ctx: Any) -> Any:
+        code = LanenetError.exit_code
         try:
             with held_to_the_end():
                 answer = super().invoke(ctx)
@@ -63,7 +64,7 @@ class _Group(TyperGroup):
         except _UsageError as error:
             _refuse_usage(error)
         except (LanenetError, OSError) as error:
-            message = str(error)
+            message, code = str(error), getattr(error, "exit_code", code)
         except MemoryError as error:
             message = f"out of memory{f' ({error})' if str(error) else ''}"
         except ModuleNotFoundError as error:
@@ -79,7 +80,7 @@ class _Group(TyperGroup):
             raise SystemExit(130) from None
         # One line: a name may hold a line feed, too.
         console.say("error: " + message.replace("\n", "\\n"), err=True)
-        raise SystemExit(1)
+        raise SystemExit(code)
 
 
 app = typer.Typer(

@@ -5,12 +5,13 @@ goes to neutral when the last one has expired, when the loop's process is gone, 
 It is a process, not a thread, so that it survives whatever stops the loop: a driver that hangs, a network
 that hangs, SIGKILL. If the guard itself is stopped or dies, a thread in the loop's process notices it by the
 silence of its pipe, and puts the actuator into neutral through a spare access. An actuator without one is
-opened again.
+opened again. Whoever is left repeats neutral until the actuator confirms it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import select
@@ -26,6 +27,7 @@ from lanenet.errors import HardwareError, LanenetError
 from lanenet.onboard.actuators.actuator import Actuator, Spare
 from lanenet.onboard.guard_process import DRIVE, MESSAGE, NEUTRAL, QUIT
 from lanenet.onboard.i2c import GUARD_MODULE
+from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, settle, undisturbed
 from lanenet.search_path import without_working_folder
 
 log = logging.getLogger(__name__)
@@ -43,12 +45,18 @@ _STUCK_S = 0.25
 _SILENT_S = 0.05
 #: Neutral again this often, while it is silent.
 _AGAIN_S = 0.02
-#: Closing takes no longer than this; chosen, as a driver needs a few milliseconds.
+#: The guard says within this time after its patience in which state it leaves the actuator; chosen ample,
+#: and below the rest of ``TimeoutStopSec=`` in the service.
+_LATE_S = 1.0
+#: A guard that has released the actuator is gone within this time; chosen ample, since it may wait for a
+#: terminal.
 _CLOSE_S = 2.0
 #: A killed process is gone within this time, unless it hangs in the kernel.
 _DIE_S = 0.1
-#: At most so many lines of the guard are read at the end; each may be an error.
-_LAST_WORDS = 8
+
+
+class StoppedError(HardwareError):
+    """The guard was asked to end, as by ``lanenet stop``: no fault."""
 
 
 @runtime_checkable
@@ -71,8 +79,12 @@ class CommandSink(Protocol):
         """Go to neutral at once; safe in a signal handler, never raises."""
         ...
 
-    def close(self) -> None:
-        """Go to neutral and release the actuator; never raises."""
+    def close(self) -> Neutral | None:
+        """Go to neutral and release the actuator; never raises.
+
+        Returns:
+            Whether the actuator confirmed neutral; None if there is none, or it was not reached.
+        """
         ...
 
 
@@ -92,7 +104,7 @@ class NoActuator:
         """Do nothing."""
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing; there is no motor."""
 
 
 class GuardedActuator:
@@ -126,7 +138,9 @@ class GuardedActuator:
         self._heard = b""
         self._sent = self._answered = 0
         self._waiting_since_s = 0.0
-        self._ready = self._closed = False
+        self._ready = self._closed = self._stopped = False
+        #: In which state the actuator was left, once that is known.
+        self._left: Neutral | None = None
 
     @property
     def pid(self) -> int:
@@ -179,8 +193,9 @@ class GuardedActuator:
         """Send a command; see :class:`CommandSink`.
 
         Raises:
-            HardwareError: If the actuator failed or takes no more commands, or the guard is gone; in the last
-                case the actuator has been put into neutral from this process.
+            HardwareError: If the actuator failed or takes no more commands, or the guard is gone; it is for
+                ``close`` to find out whether the motor is in neutral.
+            StoppedError: If the guard was asked to end.
         """
         self._order(DRIVE, steering_rad, throttle, until_s)
 
@@ -194,18 +209,17 @@ class GuardedActuator:
 
     def _order(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
         self._listen()
-        if self._closed:
-            # It has closed the actuator: its process may still be ending, which is not a hanging driver.
-            self._lost()
+        if self._stopped or self._closed:
+            # Its process may still be ending, which is not a hanging driver.
+            raise self._end()
         self._post(kind, steering_rad, throttle, until_s)
         waits = self._sent != self._answered and time.monotonic() - self._waiting_since_s > _STUCK_S
         if waits:
             # The guard cannot go to neutral any more, and the motor runs on.
             self._kill()
-            self._rescue()
             raise HardwareError(
-                f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs; the guard was "
-                "killed and neutral was set without it"
+                f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs, and its guard was "
+                "killed"
             )
 
     def _kill(self) -> None:
@@ -226,29 +240,46 @@ class GuardedActuator:
         with contextlib.suppress(HardwareError):
             self._post(NEUTRAL, 0.0, 0.0, 0.0)
 
-    def close(self) -> None:
-        """Go to neutral, end the guard and wait for it; never raises."""
+    def close(self) -> Neutral | None:
+        """Go to neutral, end the guard and wait for it; see :class:`CommandSink`.
+
+        A guard that hangs or is gone is replaced by attempts of this process.
+        """
         if self._process is None:
-            return
-        if self._watch is not None:
-            self._watch.end()
-        with contextlib.suppress(HardwareError):
-            self._post(QUIT, 0.0, 0.0, 0.0)
+            return self._left
+        end_s = time.monotonic() + PATIENCE_S
+        with undisturbed():
+            with contextlib.suppress(HardwareError):
+                self._post(QUIT, 0.0, 0.0, 0.0)
+            self._hear_out(end_s + _LATE_S)
+            if not self._closed:
+                self._kill()
+                if self._ready:
+                    self._left = settle(self._rescue, patience_s=max(end_s - time.monotonic(), 0.0))
+            if self._watch is not None:
+                self._watch.end()
         try:
             self._process.wait(_CLOSE_S)
         except subprocess.TimeoutExpired:
-            log.error("the guard does not end, its driver hangs: killing it")
             self._kill()
-            self._rescue()
-        # Its last lines say whether it left the actuator in neutral.
-        for _ in range(_LAST_WORDS):
-            with contextlib.suppress(HardwareError):
-                self._listen()
         if self._line is not None:
             self._line.close()
         if self._spare is not None:
             self._spare.release()
         self._process = self._line = self._spare = self._watch = None
+        return self._left
+
+    def _hear_out(self, end_s: float) -> None:
+        """Listen until the guard says in which state it leaves the actuator, is gone, or hangs."""
+        while self._line is not None and not self._closed:
+            left_s = end_s - time.monotonic()
+            if left_s <= 0.0 or (self._watch is not None and self._watch.silent_s > _STUCK_S):
+                log.error("the guard does not end, its driver hangs: killing it")
+                return
+            select.select([self._line], [], [], min(left_s, AGAIN_S))
+            # Each of its lines may be an error, which was told already.
+            with contextlib.suppress(HardwareError):
+                self._listen()
 
     def _post(self, kind: bytes, steering_rad: float, throttle: float, until_s: float) -> None:
         if self._line is None:
@@ -261,6 +292,8 @@ class GuardedActuator:
         except BlockingIOError:
             raise HardwareError("the actuator takes no more commands: its driver hangs") from None
         except OSError:
+            # What it said before it closed the line.
+            self._listen()
             self._lost()
 
     def _listen(self) -> None:
@@ -268,6 +301,10 @@ class GuardedActuator:
         if self._line is None:
             return
         while True:
+            # First what is left since a line was an error.
+            while b"\n" in self._heard:
+                line, _, self._heard = self._heard.partition(b"\n")
+                self._take(line.decode("utf-8", errors="replace"))
             try:
                 data = self._line.recv(4096)
             except BlockingIOError:
@@ -277,9 +314,6 @@ class GuardedActuator:
             if not data:
                 self._lost()
             self._heard += data
-            while b"\n" in self._heard:
-                line, _, self._heard = self._heard.partition(b"\n")
-                self._take(line.decode("utf-8", errors="replace"))
 
     def _take(self, line: str) -> None:
         word, _, text = line.partition(" ")
@@ -290,37 +324,42 @@ class GuardedActuator:
             self._ready = True
         elif word == "neutral":
             log.debug("the guard went to neutral: %s", text)
+        elif word == "stopped":
+            self._stopped = True
         elif word == "closed":
             self._closed = True
+            left = json.loads(text)
+            self._left = None if left is None else Neutral(*left)
         else:
             raise HardwareError(text)
 
     def _lost(self) -> None:
-        """Handle a guard that is gone: unless it closed the actuator, put it into neutral from here."""
+        """Close the line to a guard that is gone, and raise its error."""
         if self._line is not None:
             self._line.close()
             self._line = None
-        if self._closed:
-            raise HardwareError("the guard of the actuator was ended from outside; it went to neutral")
-        if not self._ready:
-            raise HardwareError(f"the guard of the actuator (process {self.pid}) died while it started")
-        self._rescue()
-        raise HardwareError(
-            f"the guard of the actuator (process {self.pid}) died; neutral was set without it"
-        )
+        raise self._end()
 
-    def _rescue(self) -> None:
-        if not self._ready:
-            return
+    def _end(self) -> HardwareError:
+        if self._stopped:
+            return StoppedError("stopped from outside")
+        if self._closed:
+            return HardwareError("the guard of the actuator has ended")
+        when = "" if self._ready else " while it started"
+        return HardwareError(f"the guard of the actuator (process {self.pid}) died{when}")
+
+    def _rescue(self) -> Neutral:
+        """Try to bring the actuator into neutral without the guard."""
         if self._spare is not None:
-            self._spare.neutral()
-            return
-        try:
+            left = self._spare.neutral()
+        else:
             actuator = self._make_actuator()
-            actuator.open()
-            actuator.close()
-        except Exception as error:
-            log.critical("the actuator could not be put into neutral: %s; disconnect the battery", error)
+            try:
+                actuator.open()
+                left = actuator.neutral()
+            finally:
+                actuator.close()
+        return left or Neutral(False, "the actuator cannot be opened")
 
 
 def _spare_of(actuator: Actuator) -> Spare | None:
@@ -342,13 +381,19 @@ class _Watch:
         """Start the thread; ``heard`` is the reading end of the guard's pipe."""
         self._heard, self._spare = heard, spare
         self._over = False
+        self._heard_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="watch of the guard", daemon=True)
         self._thread.start()
 
+    @property
+    def silent_s(self) -> float:
+        """For how long the guard has given no sign of life, [s]."""
+        return time.monotonic() - self._heard_s
+
     def end(self) -> None:
-        """End the thread, before the guard is ended."""
+        """End the thread, once the guard is gone; one that hangs in the driver is left behind."""
         self._over = True
-        self._thread.join()
+        self._thread.join(_DIE_S)
 
     def _run(self) -> None:
         poll = select.poll()
@@ -358,17 +403,21 @@ class _Watch:
             if poll.poll(1e3 * (_AGAIN_S if silent else _SILENT_S)):
                 if not os.read(self._heard, 4096):
                     break
-                silent = False
+                self._heard_s, silent = time.monotonic(), False
                 continue
-            self._neutral()
-            if not silent:
-                done = "the board's watchdog stops the motor" if self._spare is None else "neutral"
-                log.warning("the guard of the actuator has been silent for %g s: %s", _SILENT_S, done)
+            text = self._neutral()
+            if not silent and not self._over:
+                log.warning("the guard of the actuator has been silent for %g s: %s", _SILENT_S, text)
             silent = True
-        if not self._over:
-            self._neutral()
         os.close(self._heard)
+        # The guard is gone. A loop that is not held up finds that out, too, and takes over.
+        end_s = time.monotonic() + PATIENCE_S
+        while self._spare is not None and not self._over and time.monotonic() < end_s:
+            left = self._spare.neutral()
+            if left is None or left.confirmed:
+                return
+            time.sleep(AGAIN_S)
 
-    def _neutral(self) -> None:
-        if self._spare is not None:
-            self._spare.neutral()
+    def _neutral(self) -> str:
+        left = None if self._spare is None else self._spare.neutral()
+        return "its own watchdog has to stop the motor" if left is None else left.text

@@ -3,8 +3,11 @@
 :mod:`lanenet.onboard.guard` starts it with the arguments ``LINE PULSE SETTINGS FIRST WATCHDOG_S GIVE_UP_S``:
 the numbers of an open socket and of a pipe, the actuator's settings and its first writes as JSON. The loop
 sends messages of fixed size; the guard answers with lines of text: ``ready``, ``ok NUMBER`` for each message,
-``neutral REASON``, ``failed REASON`` and ``closed``. Into the pipe goes a byte at every turn, so that the
-loop's process sees at once that the guard is stopped or gone.
+``neutral REASON``, ``failed REASON``, ``stopped`` if it was asked to end, and at its end ``closed STATE``:
+the fields of a :class:`lanenet.onboard.neutral.Neutral` as JSON, null if the actuator was not reached. Into
+the pipe goes a byte at every turn, so that the loop's process sees at once that the guard is stopped or gone.
+
+At its end the guard repeats neutral until the actuator confirms it (:mod:`lanenet.onboard.neutral`).
 
 What needs time to import is imported after the first neutral.
 """
@@ -30,8 +33,9 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from lanenet.errors import LanenetError
+from lanenet.errors import LanenetError, MotorMayRunError
 from lanenet.onboard.i2c import I2CChip
+from lanenet.onboard.neutral import Neutral, settle
 
 if TYPE_CHECKING:
     from lanenet.onboard.actuators.actuator import Actuator
@@ -41,6 +45,8 @@ log = logging.getLogger("lanenet.onboard.guard")
 #: Kind of message, its number, steering, throttle, and the time at which it expires.
 MESSAGE = struct.Struct("<cxxxIddd")
 DRIVE, NEUTRAL, QUIT = b"D", b"N", b"Q"
+#: What the guard says if it was asked to end.
+STOPPED = "asked to end"
 #: What holds is sent again this often, in case it was lost on the wire; chosen: half of the time for which a
 #: command holds on the Arduino board, which must not run out between two frames of a slow camera.
 _REFRESH_S = 0.04
@@ -89,10 +95,10 @@ class Guard:
             begun_s = self._busy_s
             if time.monotonic() - begun_s <= _SLOW_S:
                 continue
-            self._actuator.neutral()
-            if begun_s != logged_s:
+            left = self._actuator.neutral()
+            if begun_s != logged_s and left is not None:
                 logged_s = begun_s
-                log.warning("neutral: the actuator's driver hangs in a command")
+                log.warning("%s: the actuator's driver hangs in a command", left.text)
 
     @contextmanager
     def _busy(self) -> Iterator[None]:
@@ -105,14 +111,12 @@ class Guard:
     def _serve(self) -> str:
         buffer = b""
         while True:
-            # The loop's process, not its loop, reads it: if it is full, nobody does.
-            with contextlib.suppress(OSError):
-                os.write(self._pulse, b".")
+            beat(self._pulse)
             left_s = self._until_s - time.monotonic() if self._driving else _TURN_S
             wait_s = min(_TURN_S, max(0.0, left_s))
             readable, _, _ = select.select([self._line], [], [], wait_s)
             if self.asked_to_end:
-                return "asked to end"
+                return STOPPED
             if readable:
                 try:
                     data = self._line.recv(65536)
@@ -167,13 +171,13 @@ class Guard:
     def _expire(self, readable: bool) -> None:
         now_s = time.monotonic()
         if self._driving and now_s >= self._until_s:
-            self._neutral()
+            text = self._neutral()
             reason = f"no command from the drive loop for {1e3 * (now_s - self._heard_s):.0f} ms"
             self._say(f"neutral {reason}")
             # A loop that hangs cannot log it. Once a second at most: a slow camera lets every command expire.
             if now_s - self._logged_s > 1.0:
                 self._logged_s = now_s
-                log.warning("neutral: %s", reason)
+                log.warning("%s: %s", text, reason)
         elif not readable and now_s - self._told_s >= _REFRESH_S:
             if self._driving:
                 self._drive()
@@ -182,13 +186,22 @@ class Guard:
         if not self._over and now_s - self._heard_s > self._give_up_s and math.isfinite(self._until_s):
             self._over = f"the drive loop was silent for {self._give_up_s:g} s"
 
-    def _neutral(self) -> None:
+    def _neutral(self) -> str:
+        """Send neutral; returns what is known of it, in words."""
         with self._busy():
-            self._actuator.neutral()
+            left = self._actuator.neutral()
         self._driving, self._told_s = False, time.monotonic()
+        return "not open" if left is None else left.text
 
     def _say(self, text: str) -> None:
         _say(self._line, text)
+
+
+def beat(pulse: int) -> None:
+    """Give the loop's process a sign of life."""
+    # The process, not its loop, reads it: if it is full, nobody does.
+    with contextlib.suppress(OSError):
+        os.write(pulse, b".")
 
 
 def _say(line: socket.socket, text: str) -> None:
@@ -275,7 +288,8 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
         build: Makes the actuator from its settings.
 
     Returns:
-        The exit code.
+        The exit code: 0 after a normal end, 1 after a fault, that of :class:`MotorMayRunError` if neutral was
+        not confirmed.
     """
     line_number, pulse, settings_json, first, watchdog_s, give_up_s = arguments
     line = socket.socket(fileno=int(line_number))
@@ -284,6 +298,8 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
     os.set_blocking(int(pulse), False)
     logging.basicConfig(level=logging.INFO, handlers=[PatientLog()])
     actuator: Actuator | None = None
+    chip: I2CChip | None = None
+    ended = False
     try:
         chip = first_neutral(first)
         actuator = build(settings_json)
@@ -302,29 +318,44 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
         gc.collect()
         gc.disable()
         _say(line, "ready")
-        reason = guard.run()
+        reason, ended = guard.run(), True
+        if reason == STOPPED:
+            _say(line, "stopped")
     except LanenetError as error:
-        _say(line, f"failed {error}")
-        return 1
+        reason = str(error)
+        _say(line, f"failed {reason}")
     except Exception as error:
-        _say(line, f"failed the guard of the actuator failed: {type(error).__name__}: {error}")
-        log.error("the guard failed: %s: %s", type(error).__name__, error)
-        return 1
+        reason = f"the guard of the actuator failed: {type(error).__name__}: {error}"
+        _say(line, f"failed {reason}")
     finally:
-        if actuator is not None:
-            _close(actuator)
-        _say(line, "closed")
+        left = None if actuator is None else _leave(actuator, int(pulse))
+        _say(line, f"closed {json.dumps(left)}")
         line.close()
         os.close(int(pulse))
+    if left is not None and left.confirmed is False:
+        log.critical("%s: %s", left.may_run, reason)
+        return MotorMayRunError.exit_code
     if chip is not None:
         chip.close()
-    log.info("neutral: %s", reason)
-    return 0
+    log.info("%s: %s", "ended" if left is None else left.text, reason)
+    return 0 if ended else 1
+
+
+def _leave(actuator: Actuator, pulse: int) -> Neutral | None:
+    """Bring the actuator into neutral and release it; one that hangs is released with the process."""
+
+    def turn() -> bool:
+        beat(pulse)
+        return True
+
+    left = settle(actuator.neutral, turn)
+    if left is None or left.confirmed is not False:
+        _close(actuator)
+    return left
 
 
 def _close(actuator: Actuator) -> None:
     try:
-        actuator.neutral()
         actuator.close()
     except Exception as error:
         # A board that was unplugged: its driver's errors are not all of them OSError (termios.error).

@@ -24,11 +24,12 @@ from jaxtyping import Int
 
 from lanenet.control.controller import LaneController, SpeedSettings, Target, throttle_of
 from lanenet.data.drives.recorder import DriveRecorder
-from lanenet.errors import HardwareError, counted
+from lanenet.errors import HardwareError, MotorMayRunError, counted
 from lanenet.onboard.arming import ArmGate, HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.frame_check import FrameCheck
-from lanenet.onboard.guard import CommandSink
+from lanenet.onboard.guard import CommandSink, StoppedError
+from lanenet.onboard.neutral import ENDING
 from lanenet.onboard.safety import (
     CommandLimiter,
     LimitSettings,
@@ -45,8 +46,6 @@ log = logging.getLogger(__name__)
 #: Longest wait for a frame, after which the loop looks after everything else. Chosen: half the watchdog's
 #: 80 ms, so that a missing frame is judged before the last command runs out.
 _WAIT_S = 0.04
-#: Ctrl-C, a stopped service, a closed terminal.
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Fine beside a frame's work of a few milliseconds; the bins reach to 500 ms, five times the largest age.
 _BIN_MS = 0.05
 _BINS = 10_000
@@ -158,9 +157,10 @@ class DriveLoop:
             Figures of the drive, and why it ended.
 
         Raises:
-            LanenetError: If camera, detector or actuator fail. The motor is in neutral by then, as after any
-                other error.
+            LanenetError: If camera, detector or actuator fail.
+            MotorMayRunError: If the actuator did not confirm neutral at the end, after whatever end.
         """
+        failure: BaseException | None = None
         with ending_signals(self.stop), _settled_memory():
             try:
                 self._parts.sink.open()
@@ -172,16 +172,24 @@ class DriveLoop:
             except SourceEnded:
                 self.report.ended = "the recording is over"
             except BaseException as error:
-                self._parts.sink.neutral()
-                if not self._asked or not isinstance(error, HardwareError):
+                if isinstance(error, StoppedError) or (self._asked and isinstance(error, HardwareError)):
+                    # Whatever ended this process often ends the guard too: no fault.
+                    self.report.ended = self._asked or str(error)
+                else:
+                    failure = error
                     when = "before the first frame" if self._number < 0 else f"in frame {self._number}"
-                    log.error("neutral: %s %s: %s", type(error).__name__, when, error)
-                    raise
-                # Whatever ended this process often ends the guard too: no fault.
-                self.report.ended = self._asked
+                    self.report.ended = f"{type(error).__name__} {when}: {error}"
+            self._parts.sink.neutral()
+            try:
+                left = self._parts.sink.close()
             finally:
                 self._close()
-        log.info("neutral: %s", self.report.ended)
+        end = f"{'ended' if left is None else left.text}: {self.report.ended}"
+        log.log(logging.INFO if failure is None else logging.ERROR, "%s", end)
+        if left is not None and left.confirmed is False:
+            raise MotorMayRunError(f"{left.may_run}; ended: {self.report.ended}") from failure
+        if failure is not None:
+            raise failure
         return self.report
 
     def stop(self, why: str) -> None:
@@ -331,8 +339,6 @@ class DriveLoop:
         return bool(self.report.ended)
 
     def _close(self) -> None:
-        self._parts.sink.neutral()
-        self._parts.sink.close()
         try:
             self._parts.source.close()
         finally:

@@ -1,8 +1,9 @@
-"""Stops a car, whatever drives it: neutral first, then the end of the process that owns the actuator.
+"""Stops a car, whatever drives it: neutral until it is confirmed, and the end of what drives.
 
-Reads the section ``actuator`` of the car's file and imports little of lanenet: the car drives on
-meanwhile. A drive that still starts owns nothing yet; it is known by a lock on its car's file, and by its
-command line, should an editor have replaced the file.
+Works where the computer is busy: the drives of the car's file and their guards are told to end before
+anything slow is imported, and the process asks for a better priority. Of the file only the section
+``actuator`` is read. A drive that still starts owns nothing yet; it is known by a lock on its car's file, and
+by its command line, should an editor have replaced the file.
 """
 
 from __future__ import annotations
@@ -16,28 +17,27 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lanenet.config import Settings, apply_overrides, check_settings, read_yaml
-from lanenet.errors import ConfigError, HardwareError, LanenetError, printable
-from lanenet.onboard.actuators import ActuatorSettings, make_actuator
-from lanenet.onboard.actuators.pca9685 import PCA9685
-from lanenet.onboard.actuators.serial_board import SerialBoardSettings
+from lanenet.errors import ConfigError, HardwareError, LanenetError, MotorMayRunError, printable
 from lanenet.onboard.i2c import GUARD_MODULE, describe_process, lock_owners, words_of
+from lanenet.onboard.neutral import AGAIN_S, Neutral, settle, undisturbed
+
+if TYPE_CHECKING:
+    from lanenet.onboard.actuators import ActuatorSettings
+    from lanenet.onboard.actuators.serial_board import SerialBoard
 
 #: A guard that is asked to end is in neutral within a turn of 15 ms and gone some milliseconds later; chosen
 #: ample, since neutral is repeated meanwhile.
 _END_S = 0.5
-#: Neutral again this often until the owner has ended; a drive sends about 30 commands a second.
-_AGAIN_S = 0.01
+#: A drive whose motor is in neutral closes its camera within 3 s, and its recording; one that takes longer
+#: hangs, for example in a network.
+_CLOSE_S = 5.0
+#: Better priorities than the usual, [nice]; the second is what the service allows.
+_PRIORITIES = (-20, -10)
 #: Where actuators are, if no file says it: I2C buses and serial lines.
 _DEVICES = Path("/dev")
 _NAMES = ("i2c-*", "ttyACM*", "ttyUSB*", "ttyAMA*", "ttyS*", "ttyTHS*")
-
-
-class _Car(Settings):
-    """The part of a car's file that says how to stop it."""
-
-    actuator: ActuatorSettings
 
 
 def read_actuator(path: Path, overrides: Sequence[str] = ()) -> ActuatorSettings:
@@ -46,10 +46,13 @@ def read_actuator(path: Path, overrides: Sequence[str] = ()) -> ActuatorSettings
     Raises:
         ConfigError: Naming the file, the key, what was found and what was expected.
     """
+    from lanenet.config import apply_overrides, read_yaml
+    from lanenet.onboard.actuators import check_actuator
+
     data = apply_overrides(read_yaml(path), list(overrides))
     if data.get("actuator") is None:
         raise ConfigError(f"{path}: key 'actuator' is missing: there is no motor to stop")
-    return check_settings(_Car, {"actuator": data["actuator"]}, str(path)).actuator
+    return check_actuator(data["actuator"], str(path))
 
 
 def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
@@ -67,13 +70,17 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
 
     Raises:
         ConfigError: If the file does not describe an actuator.
-        HardwareError: If the actuator does not answer, or its owner cannot be ended.
+        HardwareError: If its owner cannot be ended.
+        MotorMayRunError: If neutral was not confirmed.
         MissingExtraError: If its driver is not installed.
     """
+    hurry()
+    told = _tell_drives(path)
     try:
-        done = _stop_actuator(path, overrides)
+        with undisturbed():
+            done = _stop_actuator(path, overrides)
     except LanenetError as error:
-        done = _end_drives(path)
+        done = _end_drives(path, told)
         if isinstance(error, ConfigError):
             done += _end_guards()
         if not done:
@@ -82,56 +89,133 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
         if not done:
             raise
         raise type(error)("; ".join([str(error), *done])) from None
-    return [*done, *_end_drives(path)]
+    done += _end_drives(path, told)
+    return done if len(done) > 1 else [*done, "nothing of lanenet was driving"]
+
+
+def hurry() -> None:
+    """Ask for a better priority, beside other work."""
+    for priority in _PRIORITIES:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, priority)
+            return
+
+
+def _tell_drives(path: Path) -> dict[int, str]:
+    """Ask the drives of a car's file and their guards to end; returns what the drives are."""
+    drives = {pid: describe_process(pid) for pid in _drives_of(path)}
+    for pid in drives:
+        # What cannot be ended is named later.
+        with contextlib.suppress(HardwareError):
+            _tell(pid, signal.SIGTERM)
+            for guard in _children(pid):
+                if GUARD_MODULE in words_of(guard):
+                    _tell(guard, signal.SIGTERM)
+    return drives
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except (OSError, ValueError):
+        return []
 
 
 def _stop_actuator(path: Path, overrides: Sequence[str]) -> list[str]:
+    """Bring the actuator of a car's file into neutral and end its owner; returns what was done."""
+    from lanenet.onboard.actuators import make_actuator
+    from lanenet.onboard.actuators.pca9685 import PCA9685
+    from lanenet.onboard.actuators.serial_board import SerialBoard
+
     settings = read_actuator(path, overrides)
-    if isinstance(settings, SerialBoardSettings):
-        return _stop_board(settings)
     actuator = make_actuator(settings)
+    if isinstance(actuator, SerialBoard):
+        port = Path(actuator.port)
+        if not port.exists():
+            raise MotorMayRunError(
+                Neutral(False, f"{port}: no such device; is the board plugged in?").may_run
+            )
+
+        def owner() -> int:
+            with contextlib.suppress(OSError):
+                # This process holds the line while it asks the board.
+                return next((pid for pid in lock_owners(port.stat()) if pid != os.getpid()), 0)
+            return 0
+
+        return _confirm(partial(_ask_board, actuator, owner), owner)
     if not isinstance(actuator, PCA9685):
         return [f"an actuator of kind {settings.kind} has no motor"]
     try:
-        actuator.force_neutral()
-        owner = actuator.owner()
-        if not owner:
-            return ["neutral; nothing of lanenet was driving"]
-        return [f"neutral; ended {_end(owner, actuator.owner, actuator.neutral)}"]
+        actuator.attach()
+        return _confirm(actuator.neutral, actuator.owner)
     finally:
         actuator.release()
 
 
-def _stop_board(settings: SerialBoardSettings) -> list[str]:
-    """End the owner of a serial line: the board goes to neutral by its own watchdog."""
-
-    def owner() -> int:
-        return next(iter(lock_owners(Path(settings.port).stat())), 0)
-
+def _ask_board(board: SerialBoard, owner: Callable[[], int]) -> Neutral | None:
+    """Ask a board for neutral; its line has one owner at a time."""
+    if owner():
+        return Neutral(False, f"{board.port}: its owner has not ended")
     try:
-        first = owner()
-    except OSError as error:
-        raise HardwareError(f"{settings.port}: {error.strerror or error}; is the board plugged in?") from None
-    if not first:
-        return ["nothing was driving: the board is in neutral by its own watchdog"]
-    return [f"ended {_end(first, owner, lambda: None)}; the board is in neutral by its own watchdog"]
+        board.open()
+        return board.neutral()
+    except HardwareError as error:
+        return Neutral(False, str(error))
+    finally:
+        board.close()
 
 
-def _end(pid: int, owner: Callable[[], int], neutral: Callable[[], None]) -> str:
-    """End the owner of a device, politely and then by force; returns its description."""
-    text = describe_process(pid)
-    if pid < 0:
-        raise HardwareError(f"{text} still drives, which cannot be seen from here; disconnect the battery")
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        _tell(pid, number)
-        end_s = time.monotonic() + _END_S
-        while time.monotonic() < end_s:
-            neutral()
-            if owner() != pid:
-                neutral()
-                return text
-            time.sleep(_AGAIN_S)
-    raise HardwareError(f"{text} cannot be ended; disconnect the battery")
+def _confirm(neutral: Callable[[], Neutral | None], owner: Callable[[], int]) -> list[str]:
+    """Repeat neutral until it is confirmed while nobody owns the device; returns what was done.
+
+    Raises:
+        HardwareError: If the owner cannot be ended.
+        MotorMayRunError: If neutral was not confirmed.
+    """
+    ending = _Ending(owner)
+    left = settle(neutral, ending.turn) or Neutral(False, "the device is not open")
+    if left.confirmed is False:
+        raise MotorMayRunError(left.may_run)
+    return [left.text, *(f"ended {text}" for text in ending.ended)]
+
+
+class _Ending:
+    """Ends the owner of a device between attempts at neutral, politely and then by force.
+
+    Attributes:
+        ended: Descriptions of those that are gone.
+    """
+
+    def __init__(self, owner: Callable[[], int]) -> None:
+        self.ended: list[str] = []
+        self._owner = owner
+        self._pid, self._text, self._since_s = 0, "", 0.0
+        self._signals = [signal.SIGKILL, signal.SIGTERM]
+
+    def turn(self) -> bool:
+        """Take one step; returns whether nobody owns the device any more.
+
+        Raises:
+            HardwareError: If the owner cannot be ended.
+        """
+        pid, now_s = self._owner(), time.monotonic()
+        if pid != self._pid:
+            if self._pid:
+                self.ended.append(self._text)
+            self._pid, self._text, self._since_s = pid, describe_process(pid), -1.0
+            self._signals = [signal.SIGKILL, signal.SIGTERM]
+        if not pid:
+            return True
+        if pid < 0:
+            raise HardwareError(
+                f"{self._text} still drives, which cannot be seen from here; disconnect the battery"
+            )
+        if now_s - self._since_s > _END_S:
+            if not self._signals:
+                raise HardwareError(f"{self._text} cannot be ended; disconnect the battery")
+            _tell(pid, self._signals.pop())
+            self._since_s = now_s
+        return False
 
 
 def _tell(pid: int, number: signal.Signals) -> None:
@@ -145,16 +229,43 @@ def _tell(pid: int, number: signal.Signals) -> None:
             raise HardwareError(f"{text} of another user still drives; end it with sudo") from None
 
 
-def _end_drives(path: Path) -> list[str]:
-    """Ask the drives of a car's file to end, which is in neutral; returns a sentence each."""
+def _drives_of(path: Path) -> set[int]:
+    """Return the processes that drive by a car's file."""
     found = {pid for pid, files in _drives().items() if path.resolve() in files}
     with contextlib.suppress(OSError):
         # Other programs lock files, too: editors.
         found |= {pid for pid in lock_owners(path.stat()) if "drive" in words_of(pid)}
-    drives = {pid: describe_process(pid) for pid in sorted(found)}
-    for pid in drives:
+    return found - {os.getpid()}
+
+
+def _end_drives(path: Path, told: dict[int, str]) -> list[str]:
+    """End the drives of a car's file, whose motor is in neutral; by force if they are deaf.
+
+    Args:
+        path: The car's file.
+        told: Those that were asked to end already.
+
+    Returns:
+        A sentence each.
+    """
+    drives = told | {pid: describe_process(pid) for pid in _drives_of(path) - told.keys()}
+    for pid in sorted(drives):
         _tell(pid, signal.SIGTERM)
-    return [f"told {text} to end" for text in drives.values()]
+    left, end_s = set(drives), time.monotonic() + _CLOSE_S
+    while left and time.monotonic() < end_s:
+        left = {pid for pid in left if _runs(pid)}
+        time.sleep(AGAIN_S)
+    for pid in left:
+        _tell(pid, signal.SIGKILL)
+    return [f"{'killed' if pid in left else 'ended'} {text}" for pid, text in sorted(drives.items())]
+
+
+def _runs(pid: int) -> bool:
+    """Tell whether a process is there and not just waiting for its parent to notice its end."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(") ")[2][:1] not in "ZX"
+    except OSError:
+        return False
 
 
 def _drives() -> dict[int, list[Path]]:
@@ -175,13 +286,15 @@ def _drives() -> dict[int, list[Path]]:
 
 
 def _end_guards() -> list[str]:
-    """End the guards of all actuators, which is in neutral; returns a sentence each."""
+    """End the guards of all actuators, which go to neutral themselves; returns a sentence each."""
     done = []
     for device in sorted(path for name in _NAMES for path in _DEVICES.glob(name)):
         for pid in _guards_of(device):
-            owner = partial(_owner_if, device, pid)
+            ending = _Ending(partial(_owner_if, device, pid))
             try:
-                done.append(f"ended {_end(pid, owner, lambda: None)}, which had {device}")
+                while not ending.turn():
+                    time.sleep(AGAIN_S)
+                done += [f"ended {text}, which had {device}" for text in ending.ended]
             except HardwareError as error:
                 done.append(str(error))
     return done
@@ -202,24 +315,45 @@ def _owner_if(device: Path, pid: int) -> int:
 
 
 def prepare_drive(words: Sequence[str]) -> None:
-    """Prepare a drive before its imports: ``lanenet stop`` finds it, and its car is in neutral; never raises.
+    """Prepare a drive before its imports: ``lanenet stop`` finds it, and its car is in neutral.
 
     The car's file stays locked until this process ends. A car that another process drives is left alone.
 
     Args:
         words: After ``drive`` on the command line.
+
+    Raises:
+        MotorMayRunError: If the actuator is there and did not confirm neutral; nothing else.
     """
     if {"--dry-run", "--help"} & set(words):
         return
+    left = None
     # Whatever is wrong is said by the drive itself.
     with contextlib.suppress(Exception):
         path = next(path for path in map(Path, words) if path.is_file())
         fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_SH | fcntl.LOCK_NB)
         overrides = [word for word in words if "=" in word and not word.startswith("-") and word != str(path)]
-        actuator = make_actuator(read_actuator(path, overrides))
-        if isinstance(actuator, PCA9685):
+        left = _first_neutral(read_actuator(path, overrides))
+    if left is not None and left.confirmed is False:
+        raise MotorMayRunError(left.may_run)
+
+
+def _first_neutral(settings: ActuatorSettings) -> Neutral | None:
+    """Bring a PCA9685 into neutral, which goes on with its last pulse whatever happened before."""
+    from lanenet.onboard.actuators import make_actuator
+    from lanenet.onboard.actuators.pca9685 import PCA9685
+
+    actuator = make_actuator(settings)
+    if not isinstance(actuator, PCA9685):
+        return None
+    with undisturbed():
+        # A chip that does not answer yet stays attached.
+        with contextlib.suppress(HardwareError):
             actuator.open()
-            actuator.close()
+        left = settle(actuator.neutral)
+    if left is None or left.confirmed is not False:
+        actuator.close()
+    return left
 
 
 def main(words: Sequence[str]) -> int:
@@ -227,7 +361,12 @@ def main(words: Sequence[str]) -> int:
     try:
         lines = stop_car(Path(words[0]), words[1:])
     except LanenetError as error:
-        sys.stderr.write(f"error: {printable(str(error))}\n")
-        return 1
+        return fail(error)
     sys.stdout.writelines(f"{printable(line)}\n" for line in lines)
     return 0
+
+
+def fail(error: LanenetError) -> int:
+    """Say an error in one line; returns the exit code."""
+    sys.stderr.write(f"error: {printable(str(error))}\n")
+    return error.exit_code

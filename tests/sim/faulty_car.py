@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from wire_log import guarded_wire, note, settings_of
 
@@ -91,7 +92,10 @@ class Camera:
     def frame(self, age_s: float = 0.0, picture: int | None = None, small: bool = False) -> Frame:
         self.number += 1
         time.sleep(max(0.0, self.begin_s + self.number / RATE_HZ - time.monotonic()))
-        image = frames[(self.number if picture is None else picture) % len(frames)].copy()
+        number = self.number if picture is None else picture
+        # Noise of a sensor, without which the frames that come again are those of a camera that hangs.
+        noise = np.random.default_rng(number).integers(0, 4, frames[0].shape, np.uint8)
+        image = cv2.add(frames[number % len(frames)], noise)
         return Frame(image[::2, ::2] if small else image, time.monotonic() - age_s, self.number)
 
     def gone(self, timeout_s: float) -> None:

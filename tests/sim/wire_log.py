@@ -16,6 +16,7 @@ from pathlib import Path
 from lanenet.errors import HardwareError
 from lanenet.onboard.guard import GuardedActuator
 from lanenet.onboard.guard_process import main
+from lanenet.onboard.neutral import CONFIRMED, SENT, Neutral
 
 
 class WireLog:
@@ -25,6 +26,8 @@ class WireLog:
         settings = json.loads(settings_json)
         self._path = settings["path"]
         self._fail_at, self._hang_at = settings.get("fail_at"), settings.get("hang_at")
+        #: Whether neutral can be read back.
+        self._readable = settings.get("readable", True)
         self._refuse, self._unplugged = settings.get("refuse", ""), settings.get("unplugged", False)
         self._sent = 0
 
@@ -46,8 +49,9 @@ class WireLog:
             time.sleep(3600.0)
         self._write("send", steering_rad, throttle)
 
-    def neutral(self) -> None:
+    def neutral(self) -> Neutral:
         self._write("neutral")
+        return CONFIRMED if self._readable else SENT
 
     def close(self) -> None:
         self._write("close")

@@ -6,17 +6,33 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter
 
+from lanenet.config import Settings, check_settings
 from lanenet.onboard.actuators.actuator import Actuator
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PAUSE_S, PCA9685, PCA9685Settings, start_writes
 from lanenet.onboard.actuators.recorder import Recorder, RecorderSettings
 from lanenet.onboard.actuators.serial_board import SerialBoard, SerialBoardSettings
 
-__all__ = ["ActuatorSettings", "actuator_from_json", "first_writes", "make_actuator"]
+__all__ = ["ActuatorSettings", "actuator_from_json", "check_actuator", "first_writes", "make_actuator"]
 
 ActuatorSettings = Annotated[
     PCA9685Settings | SerialBoardSettings | RecorderSettings, Field(discriminator="kind")
 ]
+
+
+class _Car(Settings):
+    """The part of a car's file that says how to stop it."""
+
+    actuator: ActuatorSettings
+
+
+def check_actuator(data: Any, where: str) -> ActuatorSettings:
+    """Check the section ``actuator`` of a car's file.
+
+    Raises:
+        ConfigError: Naming the file, the key, what was found and what was expected.
+    """
+    return check_settings(_Car, {"actuator": data}, where).actuator
 
 
 def make_actuator(settings: ActuatorSettings) -> Actuator:

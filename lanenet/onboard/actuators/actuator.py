@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
+from lanenet.onboard.neutral import Neutral
+
 
 @runtime_checkable
 class Actuator(Protocol):
@@ -11,6 +13,9 @@ class Actuator(Protocol):
 
     def open(self) -> None:
         """Connect, and put the motor into neutral before anything else.
+
+        A device that is there and does not answer stays connected for further attempts at neutral, until it
+        is closed.
 
         Raises:
             HardwareError: If the device is missing or does not answer; names it and what to check.
@@ -30,8 +35,12 @@ class Actuator(Protocol):
         """
         ...
 
-    def neutral(self) -> None:
-        """Put the motor into neutral and the wheels straight, at any time; never raises."""
+    def neutral(self) -> Neutral | None:
+        """Put the motor into neutral and the wheels straight, at any time; never raises.
+
+        Returns:
+            Whether the hardware holds it, as read back from there; None if the device is not open.
+        """
         ...
 
     def close(self) -> None:
@@ -52,8 +61,8 @@ class Spare(Protocol):
         """
         ...
 
-    def neutral(self) -> None:
-        """Put the motor into neutral, at any time; never raises."""
+    def neutral(self) -> Neutral | None:
+        """Put the motor into neutral, at any time; never raises. See :meth:`Actuator.neutral`."""
         ...
 
     def release(self) -> None:

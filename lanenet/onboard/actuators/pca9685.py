@@ -8,9 +8,9 @@ Source: NXP PCA9685 data sheet, revision 4: registers in 7.3, prescaler in 7.3.5
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -21,11 +21,12 @@ from lanenet.errors import HardwareError
 from lanenet.onboard.actuators.heartbeat import HEADER, Heartbeat, HeartbeatSettings
 from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_pulses, neutral_pulses
 from lanenet.onboard.i2c import I2CChip
+from lanenet.onboard.neutral import CONFIRMED, Neutral
 
 MODE1, MODE2, LED0_ON_L, PRE_SCALE = 0x00, 0x01, 0x06, 0xFE
-RESTART, AUTO_INCREMENT, SLEEP = 0x80, 0x20, 0x10
-#: MODE2: outputs drive high and low, as servos need, and change at the I2C stop.
-OUTDRV = 0x04
+RESTART, EXTCLK, AUTO_INCREMENT, SLEEP = 0x80, 0x40, 0x20, 0x10
+#: MODE2: outputs drive high and low, as servos need, and are not inverted.
+INVRT, OUTDRV = 0x10, 0x04
 OSCILLATOR_HZ = 25e6
 COUNTS = 4096
 #: After every write of the start; the oscillator needs 0.5 ms to start after sleep.
@@ -38,8 +39,6 @@ _PULSES = (
 )  # fmt: skip
 #: What a ``myconfig.py`` may set.
 _FROM_MYCONFIG = frozenset({*_PULSES, "bus", "address", "steering_channel", "throttle_channel"})
-
-_log = logging.getLogger(__name__)
 
 
 def _shorter_than_the_period(pulse: str) -> Rule:
@@ -150,9 +149,10 @@ class PCA9685:
         self._chip: I2CChip | None = None
         self._heartbeat: Heartbeat | None = None
         self._lock = threading.Lock()
+        #: Writes of the throttle's and of the steering's output.
         self._neutral = neutral_writes(settings)
-        #: What the throttle's output holds as far as this program has written it.
-        self._throttle = self._neutral[0]
+        #: What the two outputs hold as far as this program has written them.
+        self._held = list(self._neutral)
         #: Counts calls of ``neutral``, so that a command that hung meanwhile does not undo it.
         self._stops = 0
 
@@ -161,9 +161,30 @@ class PCA9685:
 
         Raises:
             HardwareError: If bus or chip do not answer, the chip is no PCA9685, or another process owns it.
+                A chip that does not answer stays attached; see :class:`Actuator`.
             MissingExtraError: If smbus2 is not installed.
         """
-        self._connect(owner=True)
+        self.attach()
+        assert self._chip is not None
+        name = self._chip.name
+        try:
+            self._chip.own()
+            try:
+                self._start(self._chip)
+                wrong = self._differences(self._chip)
+            except OSError as error:
+                wrong = f"no PCA9685 answers ({error.strerror or error})"
+            if not wrong and self._settings.heartbeat is not None:
+                self._heartbeat = Heartbeat(self._settings.heartbeat)
+                self._heartbeat.open()
+        except HardwareError:
+            self.release()
+            raise
+        if wrong:
+            raise HardwareError(
+                f"{name}: {wrong}; look for it with i2cdetect -y {self._settings.bus}; is the chip there a "
+                "PCA9685, and does another program use it?"
+            )
 
     def attach(self) -> None:
         """Open a second access for neutral, beside the owner's; see :class:`Spare`.
@@ -176,64 +197,16 @@ class PCA9685:
         chip.open()
         self._chip = chip
 
-    def force_neutral(self) -> None:
-        """Open a second access and put the chip into neutral from any state, whoever owns it.
-
-        Raises:
-            HardwareError: If bus or chip do not answer, or the chip is no PCA9685.
-            MissingExtraError: If smbus2 is not installed.
-        """
-        self._connect(owner=False)
-
     def owner(self) -> int:
         """Return the id of the process that owns the chip; see :func:`lanenet.onboard.i2c.lock_owners`."""
         return 0 if self._chip is None else self._chip.owner()
-
-    def _connect(self, *, owner: bool) -> None:
-        self.attach()
-        assert self._chip is not None
-        try:
-            if owner:
-                self._chip.own()
-            if not owner and self._is_running(self._chip):
-                # Its owner must not find it asleep, and the pulses have no gap.
-                for data in self._neutral:
-                    self._chip.write(data)
-            else:
-                self._start()
-            if self._settings.heartbeat is not None and owner:
-                self._heartbeat = Heartbeat(self._settings.heartbeat)
-                self._heartbeat.open()
-        except OSError as error:
-            name = self._chip.name
-            self.release()
-            raise HardwareError(
-                f"{name}: no PCA9685 answers ({error.strerror or error}); look for it with i2cdetect -y "
-                f"{self._settings.bus}"
-            ) from None
-        except HardwareError:
-            self.release()
-            raise
-
-    def _start(self) -> None:
-        assert self._chip is not None
-        prescale = prescale_of(self._settings.frequency_hz)
-        for data in start_writes(self._settings):
-            self._chip.write(data)
-            time.sleep(PAUSE_S)
-        found = self._chip.read(PRE_SCALE, 1)[0]
-        if found != prescale:
-            raise HardwareError(
-                f"{self._chip.name}: register PRE_SCALE holds {found}, expected {prescale}; is the chip "
-                "there a PCA9685, and does another program use it?"
-            )
 
     def send(self, steering_rad: float, throttle: float) -> None:
         """Set both outputs; see :class:`lanenet.onboard.actuators.actuator.Actuator`.
 
         Raises:
-            HardwareError: If it is not open, a value is not finite, the chip did not answer or has restarted,
-                or another program has changed the throttle.
+            HardwareError: If it is not open, a value is not finite, the chip did not answer, or anything that
+                a pulse depends on is not as it was written.
         """
         settings, stops, chip = self._settings, self._stops, self._chip
         pulses = command_pulses(settings, steering_rad, throttle)
@@ -241,43 +214,57 @@ class PCA9685:
             raise HardwareError("pca9685: not open")
         with self._lock:
             try:
-                asleep = self._is_asleep(chip)
-                foreign = None if asleep else self._foreign_counts(chip)
-                if not asleep and foreign is None:
-                    chip.write(_pulse_write(settings, settings.steering_channel, pulses.steering_us))
-                    if stops == self._stops:
-                        self._throttle = _pulse_write(settings, settings.throttle_channel, pulses.throttle_us)
-                        chip.write(self._throttle)
+                # Neutral is what a spare access writes beside the owner; ``neutral`` changes it meanwhile.
+                wrong = self._differences(chip, self._held)
+                if not wrong and stops == self._stops:
+                    self._held = [
+                        _pulse_write(settings, settings.throttle_channel, pulses.throttle_us),
+                        _pulse_write(settings, settings.steering_channel, pulses.steering_us),
+                    ]
+                    for data in reversed(self._held):
+                        chip.write(data)
+                if stops != self._stops:
+                    for data in self._neutral:
+                        chip.write(data)
             except OSError as error:
                 raise HardwareError(
                     f"{chip.name}: the PCA9685 stopped answering ({error.strerror or error}); check its "
                     "cable and supply"
                 ) from None
-        if asleep:
+        if wrong:
             raise HardwareError(
-                f"{chip.name}: the PCA9685 has restarted and sends no pulses; check its supply"
-            )
-        if foreign is not None:
-            raise HardwareError(
-                f"{chip.name}: channel {settings.throttle_channel} holds {foreign} counts, which lanenet did "
-                "not write; does another program move the car as well (Donkeycar's manage.py)? End it first"
+                f"{chip.name}: {wrong}, which lanenet did not write; does another program use the chip "
+                "(Donkeycar's manage.py), or has it lost its supply? End the one, check the other"
             )
         self._beat()
 
-    def neutral(self) -> None:
-        """Stop the motor, then straighten the wheels; never raises."""
+    def neutral(self) -> Neutral | None:
+        """Stop the motor, straighten the wheels, and read both back; a chip that differs is started anew.
+
+        Returns:
+            Confirmed if both pulses, PRE_SCALE, sleep and inversion read as they were written; None if it is
+            not open.
+        """
         self._stops += 1
-        if self._chip is None:
-            return
+        chip = self._chip
+        if chip is None:
+            return None
         with brief_lock(self._lock):
             try:
-                self._throttle = self._neutral[0]
+                self._held = list(self._neutral)
                 for data in self._neutral:
-                    self._chip.write(data)
+                    chip.write(data)
+                wrong = self._differences(chip)
+                if wrong:
+                    self._start(chip)
+                    wrong = self._differences(chip)
             except Exception as error:
-                _log.error("pca9685: neutral could not be sent: %s", error)
-                return
+                wrong = f"no PCA9685 answers ({getattr(error, 'strerror', None) or error})"
+        if wrong:
+            return Neutral(False, f"{chip.name}: {wrong}")
+        # Else a watchdog of hardware has to switch the outputs off.
         self._beat()
+        return CONFIRMED
 
     def close(self) -> None:
         """Go to neutral and release the bus; the chip keeps sending neutral pulses."""
@@ -297,23 +284,46 @@ class PCA9685:
         if self._heartbeat is not None:
             self._heartbeat.beat()
 
-    def _is_running(self, chip: I2CChip) -> bool:
-        mode, prescale = chip.read(MODE1, 1)[0], chip.read(PRE_SCALE, 1)[0]
-        awake = mode & (SLEEP | AUTO_INCREMENT) == AUTO_INCREMENT
-        return awake and prescale == prescale_of(self._settings.frequency_hz)
+    def _start(self, chip: I2CChip) -> None:
+        for data in start_writes(self._settings):
+            chip.write(data)
+            time.sleep(PAUSE_S)
 
-    def _is_asleep(self, chip: I2CChip) -> bool:
-        """Tell whether the chip has restarted: after a moment without supply it answers, but sleeps."""
-        # Read twice: the bus has no checksum, and one wrong bit must not end a drive.
-        return all(chip.read(MODE1, 1)[0] & SLEEP for _ in range(2))
+    def _differences(self, chip: I2CChip, held: Sequence[bytes] = ()) -> str:
+        """Compare all that a pulse depends on with what was written; no lock keeps other programs out.
 
-    def _foreign_counts(self, chip: I2CChip) -> int | None:
-        """Return what another program has made of the throttle; None if it is as it was left, or neutral.
+        Args:
+            chip: To be read.
+            held: Writes of the two outputs that count as well as neutral.
 
-        No lock keeps out a program that does not ask for it.
+        Returns:
+            What differs, twice in a row: the bus has no checksum, and one wrong bit must not end a drive.
+            Empty if nothing does.
+
+        Raises:
+            OSError: If the chip does not answer.
         """
-        for _ in range(2):
-            off = chip.read(self._throttle[0] + 2, 2)
-            if off in (self._throttle[3:], self._neutral[0][3:]):
-                return None
-        return off[0] | off[1] << 8
+        return self._compare(chip, held) and self._compare(chip, held)
+
+    def _compare(self, chip: I2CChip, held: Sequence[bytes]) -> str:
+        mode1, mode2 = chip.read(MODE1, 2)
+        prescale = chip.read(PRE_SCALE, 1)[0]
+        if mode1 & SLEEP:
+            return "the chip sleeps, as after a restart, and sends no pulses"
+        registers = (
+            ("MODE1", mode1 & (EXTCLK | AUTO_INCREMENT), AUTO_INCREMENT),
+            ("MODE2", mode2 & (INVRT | OUTDRV), OUTDRV),
+            ("PRE_SCALE", prescale, prescale_of(self._settings.frequency_hz)),
+        )
+        wrong = [
+            f"register {name} holds {found}, expected {expected}"
+            for name, found, expected in registers
+            if found != expected
+        ]
+        for allowed in zip(self._neutral, held or self._neutral, strict=True):
+            output = allowed[0][0]
+            data = chip.read(output, 4)
+            if all(data != write[1:] for write in allowed):
+                counts = int.from_bytes(data[2:], "little")
+                wrong.append(f"channel {(output - LED0_ON_L) // 4} holds {counts} counts")
+        return " and ".join(wrong)

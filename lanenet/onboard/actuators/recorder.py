@@ -10,6 +10,7 @@ from typing import Literal
 from pydantic import Field
 
 from lanenet.config import Settings
+from lanenet.onboard.neutral import CONFIRMED, Neutral
 
 
 class RecorderSettings(Settings):
@@ -60,9 +61,10 @@ class Recorder:
         """Keep a command."""
         self.commands.append(SentCommand(time.monotonic(), steering_rad, throttle))
 
-    def neutral(self) -> None:
-        """Keep a command of 0 and 0."""
+    def neutral(self) -> Neutral:
+        """Keep a command of 0 and 0; confirmed, since there is no motor."""
         self.send(0.0, 0.0)
+        return CONFIRMED
 
     def close(self) -> None:
         """Keep a command of 0 and 0, once."""

@@ -47,6 +47,7 @@ from lanenet.data.files import require
 from lanenet.errors import HardwareError
 from lanenet.onboard.actuators.pulses import PulseSettings, brief_lock, command_pulses, neutral_pulses
 from lanenet.onboard.i2c import driven_already, lock_owners
+from lanenet.onboard.neutral import CONFIRMED, Neutral
 
 VERSION = 2
 BAUD = 115200
@@ -55,6 +56,8 @@ BAUD = 115200
 COMMAND_S = 0.08
 #: Time between two reports of the board.
 REPORT_S = 0.01
+#: ``neutral`` waits this long for the report that confirms it: two reports, and the lines on the way.
+_CONFIRM_S = 0.03
 #: The longest line, with its end.
 MAX_LINE = 40
 #: A line takes 3 ms; a port that takes none of it for this long is dead.
@@ -193,10 +196,17 @@ class SerialBoard:
         #: Number of the last command, and since when the board has accepted none of those that were sent;
         #: None while none is due.
         self._sequence = 0
+        #: The board's clock in the report that the last command answers, [ms].
+        self._answered_ms = 0
         self._unaccepted_s: float | None = None
         #: Where the count of losses began: command, refused, valid and dropped lines; whether it was told.
         self._counts = (0, 0, 0, 0)
         self._told = False
+
+    @property
+    def port(self) -> str:
+        """Device of the serial line."""
+        return self._settings.port
 
     @property
     def refused_lines(self) -> int:
@@ -332,26 +342,47 @@ class SerialBoard:
         if self._unaccepted_s is None:
             self._unaccepted_s = time.monotonic()
         self._sequence = (self._sequence + 1) & 0xFFFF
-        time_ms = 0 if self._report is None else self._report.time_ms
-        self._port.write(encode("S", steering_us, throttle_us, self._sequence, time_ms))
+        self._answered_ms = 0 if self._report is None else self._report.time_ms
+        self._port.write(encode("S", steering_us, throttle_us, self._sequence, self._answered_ms))
 
-    def neutral(self) -> None:
-        """Stop the motor and straighten the wheels; never raises."""
+    def neutral(self) -> Neutral | None:
+        """Stop the motor and straighten the wheels; never raises.
+
+        Returns:
+            Confirmed if the board reports neutral and can accept none of the commands that were sent any
+            more; None if it is not open.
+        """
         if self._port is None:
-            return
+            return None
         with brief_lock(self._lock) as locked:
             try:
                 self._port.write(encode("N", *self._neutral_pulses()))
-                if locked:
-                    self._unaccepted_s = None
-                    # Unread reports would fill the line, and the next command would answer an old one.
+                if not locked:
+                    return Neutral(False, f"{self._settings.port}: a command hangs")
+                self._unaccepted_s = None
+                # Unread reports would fill the line, and the next command would answer an old one.
+                self._receive()
+                end_s = time.monotonic() + _CONFIRM_S
+                while not self._is_neutral() and time.monotonic() < end_s:
+                    time.sleep(0.1 * REPORT_S)
                     self._receive()
             except Exception as error:
-                _log.error(
-                    "%s: neutral could not be sent, the board's watchdog stops the motor: %s",
-                    self._settings.port,
-                    error,
-                )
+                return Neutral(False, f"{self._settings.port}: {error}")
+        if self._is_neutral():
+            return CONFIRMED
+        return Neutral(False, f"{self._settings.port}: the board does not report neutral")
+
+    def _is_neutral(self) -> bool:
+        """Tell whether the newest report shows neutral, and no command on the way can end it.
+
+        The last command is over if the board has accepted it, has run out of its time, or has restarted.
+        """
+        report = self._report
+        if report is None or time.monotonic() - self._heard_s > self._settings.silence_s:
+            return False
+        passed_ms = (report.time_ms - self._answered_ms) % (1 << 32)
+        over = report.sequence == self._sequence or self._restarted or passed_ms > 1e3 * COMMAND_S
+        return over and report[-3:] == (0, *self._neutral_pulses())
 
     def close(self) -> None:
         """Go to neutral and release the port; the board stays in neutral."""

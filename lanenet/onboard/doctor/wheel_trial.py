@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lanenet.config import parse_yaml
-from lanenet.errors import ConfigError, LanenetError
+from lanenet.errors import ConfigError, LanenetError, MotorMayRunError
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
 from lanenet.onboard.actuators.pulses import MOST_TRIM, PulseSettings
@@ -66,6 +66,7 @@ def try_wheels(settings: DriveSettings, sink: CommandSink, ask: Ask) -> TrialRes
     Raises:
         ConfigError: If the car has no actuator with wheels.
         HardwareError: If the actuator does not answer, or fails meanwhile.
+        MotorMayRunError: If the actuator did not confirm neutral at the end.
     """
     pulses = pulses_of(settings)
     if ask("Are all wheels off the ground, and nothing near them?", "yn") != "y":
@@ -109,7 +110,9 @@ class _Holder:
     def __exit__(self, *_: object) -> None:
         self._end.set()
         self._thread.join(1.0)
-        self._sink.close()
+        left = self._sink.close()
+        if left is not None and left.confirmed is False:
+            raise MotorMayRunError(left.may_run)
 
     def hold(self, steering_rad: float, throttle: float) -> None:
         if self._failure is not None:

@@ -95,7 +95,7 @@ def test_a_car_with_a_motor_does_not_follow_a_recording(car: Path, kind: str) ->
 def test_a_device_that_is_missing_is_named_before_the_first_frame(car: Path) -> None:
     result = drive(car, "source.path=nowhere", "--dry-run")
     assert result.exit_code == 1
-    assert "neutral: HardwareError before the first frame: replay: nowhere: no such drive" in result.stderr
+    assert "ended: HardwareError before the first frame: replay: nowhere: no such drive" in result.stderr
 
 
 def test_a_dry_run_shows_what_would_be_sent(car: Path) -> None:

@@ -10,10 +10,12 @@ import pytest
 
 from lanenet.control.controller import ControlSettings, LaneController
 from lanenet.control.steering import SteeringSettings
-from lanenet.errors import HardwareError
+from lanenet.errors import HardwareError, MotorMayRunError
 from lanenet.onboard.arming import HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
+from lanenet.onboard.guard import StoppedError
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, DriveReport, LatencyHistogram, Step
+from lanenet.onboard.neutral import CONFIRMED, SENT, Neutral
 from lanenet.onboard.safety import LimitSettings, SafetySettings, State
 from lanenet.perception.camera_check import CameraCheck, Concern, Finding
 from lanenet.perception.estimate import LaneEstimate
@@ -81,6 +83,7 @@ class Wire:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self.log: list[tuple[float, str, float, float, float]] = []
+        self.left = CONFIRMED
 
     def open(self) -> None:
         self.log.append((self._clock(), "open", 0.0, 0.0, 0.0))
@@ -94,8 +97,9 @@ class Wire:
     def neutral(self) -> None:
         self.log.append((self._clock(), "neutral", 0.0, 0.0, 0.0))
 
-    def close(self) -> None:
+    def close(self) -> Neutral:
         self.log.append((self._clock(), "close", 0.0, 0.0, 0.0))
+        return self.left
 
     def moving(self) -> list[tuple[float, float]]:
         """Times from which to which the motor turns."""
@@ -353,13 +357,44 @@ def test_a_camera_with_pauses_between_its_frames_ends_the_countdown() -> None:
     assert report.states[State.DRIVING] > 15 and State.STOPPED not in report.states
 
 
+@pytest.mark.parametrize("asked", [True, False])
+def test_the_message_and_the_code_of_a_neutral_that_is_not_confirmed(
+    asked: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    car = Car(armed=True)
+    car.wire.left = Neutral(False, "no answer")
+    car.loop._watch = lambda step: car.loop.stop("SIGINT") if asked and step.frame == 20 else None
+    with pytest.raises(MotorMayRunError, match=r"disconnect the battery.*no answer.*") as caught:
+        car.loop.run()
+    assert caught.value.exit_code == 4 and ("SIGINT" in str(caught.value)) == asked
+    assert not [r for r in caplog.records if r.message.startswith("neutral:")]
+
+
+def test_a_neutral_that_cannot_be_read_back_is_a_normal_end(caplog: pytest.LogCaptureFixture) -> None:
+    car = Car(armed=True)
+    car.wire.left = SENT
+    with caplog.at_level(logging.INFO):
+        car.loop.run()
+    assert "neutral sent, not confirmed: the recording is over" in caplog.text
+
+
+def test_a_guard_that_was_asked_to_end_is_no_fault() -> None:
+    car = Car(armed=True)
+
+    def stopped(*_: object) -> None:
+        raise StoppedError("stopped from outside")
+
+    car.wire.send = stopped  # type: ignore[method-assign]
+    assert car.loop.run().ended == "stopped from outside" and not car.loop.report.by_fault
+
+
 def test_stop_is_neutral_at_once_and_for_good() -> None:
     car = Car(armed=True)
     car.loop._watch = lambda step: car.loop.stop("SIGTERM") if step.frame == 20 else None
     report = car.loop.run()
     assert report.ended == "SIGTERM" and report.frames == 21 and not report.by_fault
     kinds = [kind for _, kind, *_ in car.wire.log]
-    assert kinds[-1] == "close" and "send" not in kinds[-3:]
+    assert kinds[-2:] == ["neutral", "close"]
 
 
 def test_frames_nobody_read_and_a_last_frame_are_counted() -> None:

@@ -87,7 +87,7 @@ class GuardThread:
         finally:
             self._actuator.neutral()
             self._actuator.close()
-            self._line.send(b"closed\n")
+            self._line.send(b'closed [true, ""]\n')
             self._line.close()
             os.close(self._pulse)
 
@@ -96,7 +96,9 @@ class GuardThread:
         assert not self._thread.is_alive()
 
     def kill(self) -> None:
-        raise AssertionError("the guard hangs")
+        """Expect an end: its last word may have failed, too."""
+        self._thread.join(5.0)
+        assert not self._thread.is_alive(), "the guard hangs"
 
 
 def drive(folder: Path, settings: PCA9685Settings | SerialBoardSettings) -> None:

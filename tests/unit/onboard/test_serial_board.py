@@ -181,7 +181,7 @@ def test_board_refuses_what_is_damaged(board, actuator):
     with open(board.port, "wb", buffering=0) as wire:
         for line in bad:
             wire.write(line)
-    wait_until(lambda: actuator.neutral() or actuator.refused_lines == 12)
+    wait_until(lambda: (actuator.neutral(), actuator.refused_lines == 12)[1])
     assert len(board.lines()) == count, "a damaged line moved a servo"
 
 
@@ -202,7 +202,7 @@ def test_old_commands_are_refused(board, actuator):
         actuator._command(1900, 2000)
     time.sleep(COMMAND_S)
     os.kill(board.process.pid, signal.SIGCONT)
-    wait_until(lambda: actuator.neutral() or actuator.refused_lines == 100)
+    wait_until(lambda: (actuator.neutral(), actuator.refused_lines == 100)[1])
     assert len(board.lines()) == count, "an old command moved a servo"
     keep_sending(actuator, 0.05, 0.4, 1.0)
     board.wait_for((1900, 2000))
@@ -489,7 +489,7 @@ def test_sketch_that_hangs_is_restarted_in_neutral(uno_board):
     with pytest.raises(HardwareError, match="restarted"):
         keep_sending(actuator, 1.0, 0.4, 1.0)
     actuator.neutral()
-    wait_until(lambda: actuator.neutral() or uno_board.lines()[-1][0] > hung_s + 0.5)
+    wait_until(lambda: (actuator.neutral(), uno_board.lines()[-1][0] > hung_s + 0.5)[1])
     actuator.close()
     motor = [width_us for t_s, pin, width_us, _ in uno_board.lines() if pin == 10 and t_s > hung_s]
     # A pulse begins every 20 ms; the watchdog's time is 64 ms. The sketch starts once, with 1500 us.

@@ -4,17 +4,19 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
 import i2c_emulator
 import pytest
+from board_process import BoardProcess, build_host_board
 from typer.testing import CliRunner
 
 from lanenet import __main__
 from lanenet.cli.app import app
-from lanenet.errors import ConfigError, HardwareError, LanenetError
-from lanenet.onboard import stop
+from lanenet.errors import ConfigError, HardwareError, LanenetError, MotorMayRunError
+from lanenet.onboard import neutral, stop
 from lanenet.onboard.i2c import GUARD_MODULE, lock_owners
 
 #: A drive that still starts, as far as others see.
@@ -50,6 +52,11 @@ def car(tmp_path):
     return path
 
 
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(neutral, "PATIENCE_S", 0.2)
+
+
 def drive(bus):
     """Leave the chip as a killed drive would."""
     for data in ("0030", "fe65", "060000f401", "0a00007701", "0020"):
@@ -59,7 +66,7 @@ def drive(bus):
 
 def test_a_chip_that_nobody_drives_any_more(bus, car):
     drive(bus)
-    assert stop.stop_car(car) == ["neutral; nothing of lanenet was driving"]
+    assert stop.stop_car(car) == ["neutral", "nothing of lanenet was driving"]
     assert bus.chip.counts(0) == 370 and not bus.chip.asleep and bus.closed
     # The motor first, and without a moment of sleep in which there are no pulses.
     assert [data[0] for data in bus.wire if len(data) > 1] == [0x06, 0x0A]
@@ -86,8 +93,8 @@ def test_the_owner_is_ended(bus, car, manner, monkeypatch):
         if manner == "stopped":
             os.kill(owner.pid, signal.SIGSTOP)
         drive(bus)
-        [line] = stop.stop_car(car)
-        assert f"process {owner.pid}" in line and bus.chip.counts(0) == 370
+        state, line = stop.stop_car(car)
+        assert state == "neutral" and f"process {owner.pid}" in line and bus.chip.counts(0) == 370
         assert owner.wait(5.0) == -(signal.SIGKILL if manner == "deaf" else signal.SIGTERM)
     finally:
         owner.kill()
@@ -95,7 +102,7 @@ def test_the_owner_is_ended(bus, car, manner, monkeypatch):
 
 
 @pytest.mark.parametrize("fault", ["", "broken file", "replaced file", "removed file", "lost chip"])
-def test_a_drive_that_still_starts_is_ended(bus, car, fault):
+def test_a_drive_that_still_starts_is_ended(bus, car, fault, impatient):
     words = [sys.executable, "-ISc", STARTING, "lanenet", "drive", car.name]
     options = {"stdout": subprocess.PIPE, "cwd": car.parent}
     started = [subprocess.Popen(words, **options) for _ in range(2)]
@@ -178,36 +185,69 @@ def test_without_a_usable_file_every_guard_is_ended(tmp_path, monkeypatch, lock)
         other.communicate()
 
 
-def test_the_owner_of_a_serial_line_is_ended(tmp_path):
+def test_the_owner_of_a_serial_line_is_ended_and_the_board_asked(tmp_path):
     pytest.importorskip("serial", reason="pyserial is not installed")
-    master, slave = os.openpty()
-    port = f"serial.Serial({os.ttyname(slave)!r}, exclusive=True)"
+    board = BoardProcess([build_host_board(tmp_path)], tmp_path)
+    port = f"serial.Serial({board.port!r}, exclusive=True)"
     words = [sys.executable, "-c", f"import serial; port = {port}; print(flush=True); input()"]
     owner = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     car = tmp_path / "car.yaml"
-    car.write_text(f"actuator: {{kind: serial, port: {os.ttyname(slave)}}}\n")
+    car.write_text(f"actuator: {{kind: serial, port: {board.port}}}\n")
     try:
         owner.stdout.readline()
-        [line] = stop.stop_car(car)
-        assert f"process {owner.pid}" in line and owner.wait(5.0) == -signal.SIGTERM
-        [line] = stop.stop_car(car)
-        assert "watchdog" in line
+        state, line = stop.stop_car(car)
+        assert state == "neutral" and f"process {owner.pid}" in line
+        assert owner.wait(5.0) == -signal.SIGTERM
+        assert stop.stop_car(car) == ["neutral", "nothing of lanenet was driving"]
     finally:
         owner.kill()
         owner.communicate()
-        os.close(master)
-        os.close(slave)
+        board.stop()
 
 
-def test_bad_input_is_named(bus, car, tmp_path):
-    with pytest.raises(HardwareError, match=r"/dev/i2c-1 at 0x41: no PCA9685 answers"):
+def test_a_silent_board_is_not_called_neutral(tmp_path, impatient):
+    pytest.importorskip("serial", reason="pyserial is not installed")
+    master, slave = os.openpty()
+    car = tmp_path / "car.yaml"
+    car.write_text(f"actuator: {{kind: serial, start_s: 0.1, port: {os.ttyname(slave)}}}\n")
+    with pytest.raises(MotorMayRunError, match=r"disconnect the battery.*no answer"):
+        stop.stop_car(car)
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_chip_that_comes_back_is_waited_for(bus, car):
+    drive(bus)
+    bus.broken = True
+    back = threading.Timer(0.4, lambda: setattr(bus, "broken", False))
+    back.start()
+    assert stop.stop_car(car)[0] == "neutral" and bus.chip.counts(0) == 370
+    back.join()
+
+
+def test_a_drive_that_is_deaf_is_killed(bus, car, monkeypatch):
+    monkeypatch.setattr(stop, "_CLOSE_S", 0.3)
+    code = STARTING.replace("print", "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print")
+    words = [sys.executable, "-ISc", code, "lanenet", "drive", car]
+    deaf = subprocess.Popen(words, stdout=subprocess.PIPE)
+    try:
+        deaf.stdout.readline()
+        assert f"killed process {deaf.pid} " in stop.stop_car(car)[-1]
+        assert deaf.wait(5.0) == -signal.SIGKILL
+    finally:
+        deaf.kill()
+        deaf.communicate()
+
+
+def test_bad_input_is_named(bus, car, tmp_path, impatient):
+    with pytest.raises(MotorMayRunError, match=r"battery.*/dev/i2c-1 at 0x41: no PCA9685 answers"):
         stop.stop_car(car, ["actuator.address=0x41"])
     with pytest.raises(ConfigError, match=r"car\.yaml.*actuator\.steering_left'.*steering_left_us"):
         stop.stop_car(car, ["actuator.steering_left=3"])
     car.write_text("camera: nowhere.yaml\n")
     with pytest.raises(ConfigError, match=r"car\.yaml: key 'actuator'"):
         stop.stop_car(car)
-    with pytest.raises(HardwareError, match="/nowhere: No such file"):
+    with pytest.raises(HardwareError, match="/nowhere: no such device"):
         stop.stop_car(car, ["actuator={kind: serial, port: /nowhere}"])
 
 
@@ -228,7 +268,8 @@ def test_it_waits_for_no_other_part_of_lanenet():
     code = "import sys, lanenet.onboard.stop; print(*sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = {name.partition(".")[0] for name in result.stdout.split()}
-    assert not {"cv2", "numpy", "onnxruntime", "jaxtyping", "typer", "rich", "serial"} & loaded
+    slow = {"cv2", "numpy", "onnxruntime", "jaxtyping", "typer", "rich", "serial", "pydantic", "yaml"}
+    assert not slow & loaded
 
 
 def test_the_program_prepares_a_drive_before_it_imports_the_command_line(bus, car, monkeypatch):

@@ -1,0 +1,131 @@
+"""Neutral as a fact: what the hardware confirms of it, and its repetition until it does.
+
+Imports little: the guard and ``lanenet stop`` need it before anything else.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+log = logging.getLogger(__name__)
+
+#: Ctrl-C, a stopped service, a closed terminal.
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Neutral is repeated for this long until the hardware confirms it. Chosen: a connector that slipped is back
+#: within seconds, and a person who waits for longer has disconnected the battery.
+PATIENCE_S = 15.0
+#: Where nothing can be read back, neutral is repeated for this long: an outage of the wire by motor noise is
+#: shorter.
+SENT_S = 0.5
+#: Between two attempts; a command takes a few milliseconds.
+AGAIN_S = 0.01
+
+
+class Neutral(NamedTuple):
+    """What is known of the motor after neutral was sent.
+
+    Attributes:
+        confirmed: Whether the hardware holds neutral; None where nothing can be read back.
+        why: Why it is not confirmed.
+    """
+
+    confirmed: bool | None
+    why: str = ""
+
+    @property
+    def text(self) -> str:
+        """The state in words; "neutral" without an addition only where it is confirmed."""
+        if self.confirmed:
+            return "neutral"
+        reason = f" ({self.why})" if self.why else ""
+        return f"neutral {'sent, ' if self.confirmed is None else ''}not confirmed{reason}"
+
+    @property
+    def may_run(self) -> str:
+        """What a person has to do if neutral could be confirmed and was not."""
+        return f"the motor may run, disconnect the battery: {self.text}"
+
+
+CONFIRMED, SENT = Neutral(True), Neutral(None)
+
+
+def settle(
+    neutral: Callable[[], Neutral | None],
+    turn: Callable[[], bool] = lambda: True,
+    patience_s: float | None = None,
+) -> Neutral | None:
+    """Repeat neutral until the hardware confirms it, or the time is over.
+
+    A driver may hang, so the attempts are made in a thread, which is left behind if it does not return.
+
+    Args:
+        neutral: One attempt; None if its device is not open, which ends the attempts.
+        turn: Called between attempts, every ``AGAIN_S``; while it returns False, no answer counts.
+        patience_s: Longest time, [s], ``PATIENCE_S`` by default; ``SENT_S`` where nothing can be read back.
+
+    Returns:
+        The last attempt's answer; None if the device is not open.
+    """
+    answer: Neutral | None = Neutral(False, "the actuator's driver does not return")
+    begun = done = 0
+    over, fresh = threading.Event(), threading.Event()
+
+    def repeat() -> None:
+        nonlocal answer, begun, done
+        while not over.is_set():
+            begun += 1
+            try:
+                answer = neutral()
+            except Exception as error:
+                answer = Neutral(False, f"{type(error).__name__}: {error}")
+            done = begun
+            fresh.set()
+            over.wait(AGAIN_S)
+
+    patience_s = PATIENCE_S if patience_s is None else patience_s
+    start_s = time.monotonic()
+    counts, ignored, told = turn(), 0, False
+    threading.Thread(target=repeat, name="neutral", daemon=True).start()
+    try:
+        while True:
+            fresh.wait(AGAIN_S)
+            fresh.clear()
+            if counts and done > ignored and (answer is None or answer.confirmed):
+                return answer
+            passed_s = time.monotonic() - start_s
+            unreadable = counts and answer is not None and answer.confirmed is None
+            if passed_s >= (SENT_S if unreadable else patience_s):
+                return answer
+            if not told and passed_s >= SENT_S and answer is not None:
+                told = True
+                log.warning("%s; trying for %g s", answer.text, patience_s)
+            if (agreed := turn()) and not counts:
+                # An attempt that had begun before may have been undone since.
+                ignored = begun
+            counts = agreed
+    finally:
+        over.set()
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Let no ending signal interrupt what brings the motor into neutral; does nothing in other threads."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def refuse(number: int, _frame: Any) -> None:
+        log.warning("%s: neutral is being confirmed first", signal.Signals(number).name)
+
+    before = {n: signal.signal(n, refuse) for n in ENDING if signal.getsignal(n) != signal.SIG_IGN}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
