@@ -22,12 +22,14 @@ class Frame:
         t_s: Time of exposure on the clock of :func:`time.monotonic`; the time of arrival if that is unknown.
         number: Counts all frames of the source, also those that were not read.
         age_known: Whether ``t_s`` is the time of exposure.
+        lap: Repetition of a recording in a loop, whose images come again; 0 of a camera.
     """
 
     image_bgr: UInt8[np.ndarray, "h w 3"] = field(repr=False)
     t_s: float
     number: int
     age_known: bool = True
+    lap: int = 0
 
 
 @runtime_checkable

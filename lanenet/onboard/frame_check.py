@@ -35,12 +35,15 @@ class FrameCheck:
     def __init__(self, settings: SafetySettings) -> None:
         """Take the limits; no frame has been seen."""
         self._settings = settings
-        self._repeats = RepeatCheck()
+        self._repeats, self._lap = RepeatCheck(), 0
 
     def fault_of(self, frame: Frame | None, now_s: float) -> str:
         """Return what is wrong with a frame; empty if nothing is."""
         if frame is None:
             return "no frame from the camera"
+        if frame.lap != self._lap:
+            # A short recording in a loop is no camera that hangs.
+            self._repeats, self._lap = RepeatCheck(), frame.lap
         repeated = "" if self._settings.allow_repeated_frames else self._repeats.fault_of(frame.image_bgr)
         age_s = now_s - frame.t_s
         if not math.isfinite(age_s) or age_s < -_MAX_AHEAD_S:

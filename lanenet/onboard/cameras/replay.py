@@ -105,7 +105,7 @@ class ReplaySource:
             number = self._next
             self._next += 1
             try:
-                return Frame(drive.image(row), due_s, number)
+                return Frame(drive.image(row), due_s, number, lap=lap)
             except DriveFormatError as error:
                 self._note(error, len(drive))
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from lanenet.data.drives import open_drive
+from lanenet.data.drives.folder import DriveWriter
+from lanenet.onboard.cameras.replay import ReplaySettings
 from lanenet.onboard.devices import Frame
 from lanenet.onboard.frame_check import FrameCheck, RepeatCheck
 from lanenet.onboard.safety import SafetySettings
@@ -70,6 +72,20 @@ def test_a_repeated_frame_is_a_hanging_camera() -> None:
     assert check.fault_of(frame(0.15, 4, 3), 0.15) == ""
     lenient = FrameCheck(SafetySettings(allow_repeated_frames=True))
     assert [lenient.fault_of(frame(0.03 * k, k), 0.03 * k) for k in range(3)] == [""] * 3
+
+
+def test_a_short_recording_in_a_loop_is_no_hanging_camera(tmp_path: Path) -> None:
+    images = list(itertools.islice(exposures(), 5))
+    images[3] = images[2]
+    with DriveWriter(tmp_path / "drive") as writer:
+        for k, image in enumerate(images):
+            writer.add(image, 0.05 * k)
+    source = ReplaySettings(path=tmp_path / "drive", pace="fast", loop=True).make_source()
+    source.open()
+    check = FrameCheck(SafetySettings())
+    faults = [check.fault_of(frame, frame.t_s) for _ in range(20) if (frame := source.read(1.0)) is not None]
+    source.close()
+    assert [k % 5 for k, fault in enumerate(faults) if fault] == [3] * 4
 
 
 @pytest.mark.parametrize("buffers", [2, 3, 32])
