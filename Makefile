@@ -21,7 +21,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train general install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew arm release pictures wheels neutral check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -43,7 +43,8 @@ help:
 	@echo "make pictures     the moving picture of the README, from a recorded drive (DRIVE, LANE_WIDTH, SHOWN)"
 	@echo "make release      source archive and wheel of this version into dist/ (needs g++)"
 	@echo "make wheels       wheels for x86-64 and 64-bit Arm into dist/ (needs g++ and g++-aarch64-linux-gnu)"
-	@echo "make neutral      how long the motor runs on when the drive or its guard is killed or stopped"
+	@echo "make neutral      how long the motor runs on when drive or guard are killed or stopped, or the bus is away"
+	@echo "make faults       outages of the bus, late and hanging cameras, wrong settings: a table in ten minutes"
 	@echo "make docs         the documentation as a site into site/; any broken link or warning fails it"
 	@echo "make figures      draw frames, windows and lengths anew, and the board to print, into docs/"
 	@echo "make links        ask for every address that the documents name (needs the network)"
@@ -145,6 +146,12 @@ arm: $(VENV)/.stamp-train
 # Twenty times each; for true times leave the machine alone meanwhile. Needs g++.
 neutral: $(VENV)/.stamp-dev
 	$(PYTEST) -s --numprocesses 0 tests/sim/test_neutral_times.py
+	PYTHONPATH=tests/sim:tests/support OMP_NUM_THREADS=1 $(BIN)/python tests/sim/outages.py 20
+
+# Less than ten minutes; FAULTS is the number of repetitions.
+FAULTS ?= 5
+faults: $(VENV)/.stamp-dev
+	PYTHONPATH=tests/sim:tests/support OMP_NUM_THREADS=1 $(BIN)/python tests/sim/faults.py $(FAULTS)
 
 check: format-check lint types imports test
 

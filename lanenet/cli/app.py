@@ -79,7 +79,8 @@ class _Group(TyperGroup):
             typer.echo("interrupted", err=True)
             raise SystemExit(130) from None
         # One line: a name may hold a line feed, too.
-        console.say("error: " + message.replace("\n", "\\n"), err=True)
+        with console.told_or_lost():
+            console.say("error: " + message.replace("\n", "\\n"), err=True)
         raise SystemExit(code)
 
 

@@ -15,6 +15,8 @@ from bus_wire import BUS, SETTINGS, Wire
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
+from lanenet.errors import MotorMayRunError
+from lanenet.onboard.neutral import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[2]
 UNIT = ROOT / "contrib" / "lanenet.service"
@@ -79,7 +81,7 @@ def in_systemd(tmp_path):
     }
     (tmp_path / "car.yaml").write_text("actuator: {kind: pca9685}\n")
     # What is left out is for the user and devices of a car, or needs a manager of the system.
-    kept = ("Type", "KillSignal", "KillMode", "TimeoutStopSec", *lines)
+    kept = ("Type", "KillSignal", "KillMode", "TimeoutStopSec", "RestartPreventExitStatus", *lines)
     unit = [
         f"{key}={lines.get(key, value)}"
         for key, value in (line.split("=", 1) for line in UNIT.read_text().splitlines() if "=" in line)
@@ -88,12 +90,14 @@ def in_systemd(tmp_path):
     path = os.pathsep.join([str(BUS), str(ROOT)])
     unit += [f"Environment=PYTHONPATH={path} LANENET_TEST_BUS={tmp_path}"]
     (tmp_path / "units").mkdir()
-    (tmp_path / "units" / "car.service").write_text("\n".join(["[Service]", *unit, ""]))
     for name in ("basic", "shutdown"):
         (tmp_path / "units" / f"{name}.target").write_text("[Unit]\nDefaultDependencies=no\n")
 
-    def run(*strikes):
-        """Strike the driving car; returns its wire and when it was struck."""
+    def run(*strikes, restart=False):
+        """Strike the driving car; returns when it was struck, the processes, and how the unit ended."""
+        more = ["Restart=on-failure"] if restart else []
+        assert not restart or more[0] in UNIT.read_text()
+        (tmp_path / "units" / "car.service").write_text("\n".join(["[Service]", *unit, *more, ""]))
         words = ["bash", str(ROOT / "tests" / "support" / "in_systemd.sh"), str(tmp_path)]
         words += [sys.executable, str(Path(__file__)), str(tmp_path), *strikes]
         environment = {
@@ -104,8 +108,8 @@ def in_systemd(tmp_path):
         if done.returncode == 77:
             pytest.skip(f"no systemd can be started here: {done.stderr[-200:] or 'not root, or no systemd'}")
         assert done.returncode == 0, done.stdout + done.stderr
-        struck_s, car, guard = done.stdout.split()
-        return float(struck_s), int(car), int(guard)
+        struck_s, car, guard, *end = done.stdout.split()
+        return float(struck_s), int(car), int(guard), end
 
     return run
 
@@ -123,12 +127,21 @@ def strike_in_systemd(folder, strikes):
     time.sleep(0.3)
     struck_s = time.monotonic()
     for strike in strikes:
-        control(*strike.split(), "car.service")
-    end_s = time.monotonic() + 30.0
+        if strike == "outage":
+            (folder / "outage").write_text("inf fails")
+        elif strike == "lanenet stop":
+            environment = {**os.environ, "LANENET_TEST_BUS": str(folder)}
+            environment["PYTHONPATH"] = os.pathsep.join([str(BUS), environment["PYTHONPATH"]])
+            words = [sys.executable, "-m", *strike.split(), str(folder / "car.yaml")]
+            subprocess.run(words, check=True, env=environment, capture_output=True)
+        else:
+            control(*strike.split(), "car.service")
+    end_s = time.monotonic() + 60.0
     while control("show", "car.service", "--property=ActiveState", "--value") not in ("failed", "inactive"):
         assert time.monotonic() < end_s
         time.sleep(0.05)
-    sys.stdout.write(f"{struck_s} {car} {guard}")
+    told = control("show", "car.service", "--property=ExecMainCode,ExecMainStatus,NRestarts")
+    sys.stdout.write(f"{struck_s} {car} {guard} {told}")
 
 
 @pytest.mark.slow
@@ -143,13 +156,32 @@ def strike_in_systemd(folder, strikes):
     ids=["stopped", "loop killed", "all killed"],
 )
 def test_it_ends_in_neutral_under_systemd(in_systemd, tmp_path, strikes, by_guard):
-    struck_s, car, guard = in_systemd(*strikes)
+    struck_s, car, guard, _ = in_systemd(*strikes)
     wire = Wire(tmp_path)
     neutral = [write for write in wire.throttles(driving=False) if write.t_s >= struck_s]
     assert max(write.t_s for write in wire.throttles(driving=True)) < neutral[0].t_s
     # The guard was not killed before it had done its work, and ExecStopPost has done it again.
     assert (neutral[0].process == guard) == by_guard
     assert neutral[-1].process not in (car, guard)
+
+
+def test_a_drive_that_was_stopped_on_purpose_is_not_started_again(in_systemd, tmp_path):
+    struck_s, _, _, end = in_systemd("lanenet stop", restart=True)
+    assert {"ExecMainStatus=0", "NRestarts=0"} <= set(end)
+    assert not [write for write in Wire(tmp_path).throttles(driving=True) if write.t_s > struck_s + 0.5]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strikes", [["outage"], ["outage", "stop"]], ids=["it ends itself", "stopped"])
+def test_a_neutral_that_is_not_confirmed_ends_with_its_code_and_no_new_drive(in_systemd, strikes):
+    *_, end = in_systemd(*strikes, restart=True)
+    # CLD_EXITED: it was not killed by the time limit.
+    assert {"ExecMainCode=1", f"ExecMainStatus={MotorMayRunError.exit_code}", "NRestarts=0"} == set(end)
+
+
+def test_the_time_to_stop_is_longer_than_the_patience_and_the_code_is_known(service):
+    assert float(service["TimeoutStopSec"]) > PATIENCE_S + 2.0
+    assert int(service["RestartPreventExitStatus"]) == MotorMayRunError.exit_code
 
 
 if __name__ == "__main__":

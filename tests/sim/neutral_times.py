@@ -1,12 +1,14 @@
 """How long a motor runs on when processes of a drive are killed or stopped, many times over, on any wire.
 
-Run as a program, ``python neutral_times.py SETTINGS``, it is the smallest drive: full throttle, 30 times per
-second, through the real guard to the actuator of these settings (JSON), until that fails.
+Run as a program, ``python neutral_times.py SETTINGS``, it is the smallest drive: the drive loop with a camera
+of noise, 30 times per second, through the real guard to the actuator of these settings (JSON), until it ends.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
+import logging
 import os
 import signal
 import subprocess
@@ -16,10 +18,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from lanenet.errors import HardwareError
+import numpy as np
+from pydantic import TypeAdapter
+
+from lanenet.errors import LanenetError
+from lanenet.onboard.actuators import ActuatorSettings, first_writes
+from lanenet.onboard.devices import Frame
 from lanenet.onboard.guard import GuardedActuator
 from lanenet.onboard.guard_process import actuator_from_json
 from lanenet.onboard.safety import SafetySettings
+from lanenet.perception.estimate import LaneEstimate
 
 #: Which signal the loop's process and its guard get; None for none.
 FAULTS: dict[str, tuple[signal.Signals | None, signal.Signals | None]] = {
@@ -46,13 +54,13 @@ class Start(Protocol):
     def __call__(self) -> subprocess.Popen[bytes]: ...
 
 
-def sender(settings_json: str, log: Path) -> Start:
+def sender(settings_json: str, log: Path, environment: dict[str, str] | None = None) -> Start:
     """The smallest drive."""
 
     def start() -> subprocess.Popen[bytes]:
         with log.open("ab") as stream:
             words = [sys.executable, __file__, settings_json]
-            return subprocess.Popen(words, stdout=stream, stderr=stream)
+            return subprocess.Popen(words, stdout=stream, stderr=stream, env=environment)
 
     return start
 
@@ -110,20 +118,62 @@ def table(times_s: dict[str, list[float]]) -> str:
 
 
 def main(settings_json: str) -> int:
-    safety = SafetySettings()
+    """Drive at a constant throttle by a lane that never changes; returns the code of ``lanenet drive``."""
+    from lanenet.control.controller import ControlSettings, LaneController
+    from lanenet.control.steering import SteeringSettings
+    from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode
+    from lanenet.onboard.safety import LimitSettings
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    safety = SafetySettings(countdown_s=0.0)
+    actuator = TypeAdapter(ActuatorSettings).validate_json(settings_json)
     sink = GuardedActuator(
-        settings_json, lambda: actuator_from_json(settings_json), safety.watchdog_s, safety.end_after_s
+        settings_json,
+        lambda: actuator_from_json(settings_json),
+        safety.watchdog_s,
+        safety.end_after_s,
+        first_json=json.dumps(first_writes(actuator)),
     )
+    control = ControlSettings(steering=SteeringSettings(wheelbase_cm=26.0))
+    parts = CarParts(Camera(), Eye(), LaneController(control), sink)
+    # The throttle is there with the first command.
+    limits = LimitSettings(throttle_rate_s=100.0)
+    loop = DriveLoop(parts, safety, limits, control.speed, DriveMode(armed=True))
     try:
-        sink.open()
-        while True:
-            sink.send(0.1, 1.0, time.monotonic() + safety.watchdog_s)
-            time.sleep(1.0 / RATE_HZ)
-    except HardwareError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    finally:
-        sink.close()
+        return 1 if loop.run().by_fault else 0
+    except LanenetError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+
+
+class Camera:
+    """A camera of noise, 30 frames per second."""
+
+    def __init__(self) -> None:
+        self._number = -1
+        self._noise = np.random.default_rng(0)
+
+    def open(self) -> None:
+        self._begin_s = time.monotonic()
+
+    def read(self, timeout_s: float) -> Frame:
+        self._number += 1
+        time.sleep(max(0.0, self._begin_s + self._number / RATE_HZ - time.monotonic()))
+        image = self._noise.integers(0, 256, (24, 32, 3), np.uint8)
+        return Frame(image, time.monotonic(), self._number)
+
+    def close(self) -> None:
+        pass
+
+
+class Eye:
+    """Sees a straight lane."""
+
+    def detect(self, frame_bgr: np.ndarray) -> LaneEstimate:
+        return LaneEstimate(np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0]), confidence=1.0)
+
+    def reset(self) -> None:
+        pass
 
 
 if __name__ == "__main__":

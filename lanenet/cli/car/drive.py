@@ -67,20 +67,23 @@ def drive(
         loop = build_loop(
             settings, arm=arm, steering_only=steering_only, dry_run=dry_run, hold=held, watch=watch, show=seen
         )
-        console.show_problems(loop.problems)
+        with console.told_or_lost():
+            console.show_problems(loop.problems)
         report = loop.run(frames)
-    console.show_lines(report.lines())
-    console.wrote(report.recording, *views.files)
+    with console.told_or_lost():
+        console.show_lines(report.lines())
+        console.wrote(report.recording, *views.files)
     if report.by_fault:
         raise LanenetError(f"the car had to stop: {report.ended}; it does not start again by itself")
+    words: list[str | Path]
     if report.recording is not None:
-        console.next_command("map", report.recording, "--lane-width", "CM", "--out", "MAP")
+        words = ["map", report.recording, "--lane-width", "CM", "--out", "MAP"]
     elif settings.actuator is not None and not arm:
-        console.next_command(
-            "drive", config, *(overrides or []), "--arm" if steering_only else "--steering-only"
-        )
+        words = ["drive", config, *(overrides or []), "--arm" if steering_only else "--steering-only"]
     else:
-        console.next_command("bench")
+        words = ["bench"]
+    with console.told_or_lost():
+        console.next_command(*words)
 
 
 def _show(views: Views, stack: ExitStack, settings: DriveSettings) -> Show:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import shlex
 import sys
 import time
@@ -231,6 +232,18 @@ def _write_stderr(text: str) -> None:
     with suppress(OSError, ValueError):
         sys.stderr.write(text)
         sys.stderr.flush()
+
+
+@contextmanager
+def told_or_lost() -> Iterator[None]:
+    """Go on where a text cannot be written, as into a file on a full disk: a car does not stop for it."""
+    try:
+        yield
+    except OSError:
+        # Python would end with an error of its own for what is left in the buffer.
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def say(text: str, err: bool = False) -> None:

@@ -2,7 +2,8 @@
 
 A folder (``LANENET_TEST_BUS``) holds the chip's registers, which is also the bus device that is locked, and
 the wire: a line ``time process register bytes`` for every write, and ``time process beat`` for every pulse of
-the heartbeat.
+the heartbeat. A file ``outage`` there, with the time of its end and "fails" or "hangs", is an outage of the
+bus: transfers fail at once, or come back when it is over.
 """
 
 import errno
@@ -18,6 +19,17 @@ ADDRESS = 0x40
 POWER_ON = bytes([0x11, 0x04]) + bytes(0xFC) + bytes([30]) + bytes(1)
 GET_LINE, SET_VALUES = 0xC250B407, 0xC010B40F
 _ioctl = fcntl.ioctl
+
+
+def _outage():
+    try:
+        end_s, manner = (FOLDER / "outage").read_text().split()
+    except OSError:
+        return
+    left_s = float(end_s) - time.monotonic()
+    if left_s > 0.0 and manner == "fails":
+        raise OSError(errno.EREMOTEIO, "Remote I/O error")
+    time.sleep(min(max(left_s, 0.0), 3600.0))
 
 
 def _note(text):
@@ -68,6 +80,7 @@ class SMBus:
         self._pointer = 0
 
     def i2c_rdwr(self, *messages):
+        _outage()
         for message in messages:
             if message.address != ADDRESS:
                 raise OSError(errno.EREMOTEIO, "Remote I/O error")

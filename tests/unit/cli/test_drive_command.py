@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import logging
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ def car(tmp_path: Path) -> Path:
     """A config that replays a painted drive at full speed, with the lane filter."""
     camera = example_camera()
     with DriveWriter(tmp_path / "drive", camera, LANE_WIDTH_CM) as writer:
-        for k, frame in enumerate(example_frames(camera, 8, np.random.default_rng(0)) * 3):
+        for k, frame in enumerate(example_frames(camera, 24, np.random.default_rng(0))):
             writer.add(frame, 0.05 * k, throttle=0.2)
     config = {
         "source": {"kind": "replay", "path": str(tmp_path / "drive"), "pace": "fast"},
@@ -115,6 +117,16 @@ def test_the_log_and_the_live_line_go_to_stderr_and_leave_nothing_behind(car: Pa
     assert (log.level, list(log.handlers)) == before
 
 
+@pytest.mark.parametrize("full", ["stdout", "stderr"])
+def test_a_full_disk_under_what_is_said_ends_no_drive(car: Path, full: str) -> None:
+    words = [sys.executable, "-m", "lanenet", "drive", str(car), "--dry-run"]
+    with Path("/dev/full").open("wb") as disk:
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, full: disk}
+        done = subprocess.run(words, **streams, check=False, timeout=60)
+    assert done.returncode == 0
+    assert b"Traceback" not in (done.stderr or b"") and (full == "stdout" or b"24 frames" in done.stdout)
+
+
 def test_a_car_without_an_actuator_says_what_to_do(car: Path) -> None:
     result = drive(car)
     assert result.exit_code == 1 and "or --dry-run" in result.stderr
@@ -137,7 +149,7 @@ def test_an_armed_car_drives_through_its_guard(car: Path) -> None:
 def test_an_armed_car_that_has_to_stop_ends_with_an_error(car: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     held = iter([""] * 40)
     monkeypatch.setattr(HoldFile, "fault", property(lambda _: next(held, "the key is not there")))
-    again = ("source.loop=true", "safety.end_after_s=0.2")
+    again = ("source.loop=true", "safety.end_after_s=0.2", "safety.allow_repeated_frames=true")
     result = drive(car, "actuator={kind: recorder}", *again, "--arm", "--hold", "key")
     assert result.exit_code == 1
     assert "the car had to stop: not held: the key is not there" in result.stderr

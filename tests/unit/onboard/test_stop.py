@@ -251,9 +251,9 @@ def test_bad_input_is_named(bus, car, tmp_path, impatient):
         stop.stop_car(car, ["actuator={kind: serial, port: /nowhere}"])
 
 
-def test_names_cannot_command_the_terminal(capsys):
+def test_names_cannot_command_the_terminal(capfd):
     assert stop.main(["\x1b[2Jcar.yaml"]) == 1
-    assert "car.yaml: no such file" in (told := capsys.readouterr().err) and "\x1b" not in told
+    assert "car.yaml: no such file" in (told := capfd.readouterr().err) and "\x1b" not in told
 
 
 def test_the_verb(bus, car):

@@ -1,0 +1,53 @@
+"""Neutral after an outage of the bus; `make faults` runs the whole round, `make neutral` twenty of each."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from outages import FAULTS, MANNERS, Case, Result, rate_changes, run, stop_under_load
+
+#: The system may wake a process late, and a busy test machine does: one of so many has to keep the time.
+TRIES = 3
+
+
+def try_outage(case: Case, folder: Path) -> Result:
+    for number in range(TRIES):
+        result = run(case, folder / str(number))
+        if not result.wrong:
+            break
+    return result
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_motor_is_in_neutral_when_the_bus_is_back(fault: str, tmp_path: Path) -> None:
+    result = try_outage(Case(fault, 0.12), tmp_path)
+    assert not result.wrong, f"{result.wrong}\n{result.said}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("manner", MANNERS)
+@pytest.mark.parametrize("outage_s", [0.02, 1.0, 6.0])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_outages_short_and_long(fault: str, outage_s: float, manner: str, tmp_path: Path) -> None:
+    result = try_outage(Case(fault, outage_s, manner), tmp_path)
+    assert not result.wrong, f"{result.wrong}\n{result.said}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("manner", MANNERS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bus_that_stays_away_is_said_and_has_a_code(fault: str, manner: str, tmp_path: Path) -> None:
+    result = run(Case(fault, math.inf, manner), tmp_path / "bus")
+    assert not result.wrong, f"{result.wrong}\n{result.said}"
+
+
+def test_another_rate_of_the_chip_is_noticed_and_mended() -> None:
+    tries = [dict(rate_changes()) for _ in range(TRIES)]
+    assert all(min(found[rate_hz] for found in tries) <= 0.1 for rate_hz in tries[0])
+
+
+@pytest.mark.slow
+def test_stop_is_quick_beside_other_work() -> None:
+    assert sorted(stop_under_load(20))[-2] <= FAULTS["stop"]
