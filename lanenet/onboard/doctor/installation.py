@@ -16,6 +16,7 @@ from lanenet.data.camera_file import read_camera
 from lanenet.errors import LanenetError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
+from lanenet.onboard.cameras import jpeg
 from lanenet.perception.edges import compiled
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 from lanenet.perception.network import compiled as network_compiled
@@ -60,7 +61,7 @@ def run_checks(camera: Path | None = None) -> list[Check]:
     Returns:
         All checks in the order of the report; problems are checks, not errors.
     """
-    checks = [_python(), *_packages(), _opencv_packages(), _opencv(), _kernels(), _onnxruntime()]
+    checks = [_python(), *_packages(), _opencv_packages(), _opencv(), _jpeg(), _kernels(), _onnxruntime()]
     if camera is not None:
         checks += check_camera_file(camera)
     return checks
@@ -183,6 +184,28 @@ def _opencv() -> Check:
     if columns.size != 1 or abs(int(columns[0]) - 15.5) > 1.0 or back is None or back.shape != step.shape:
         return Check("opencv", "problem", f"{cv2.__version__}: self test gave a wrong answer; reinstall it")
     return Check("opencv", "ok", f"{cv2.__version__}, edges and JPEG work")
+
+
+def _jpeg() -> Check:
+    """Test the decoder of camera images with one that lost bytes in its middle."""
+    if not jpeg.is_strict():
+        text = (
+            "cannot be loaded: of images that lost bytes fewer are refused; pip install --force-reinstall it"
+        )
+        return Check("simplejpeg", "note", text)
+    try:
+        import cv2
+
+        noise = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8)
+        whole = cv2.imencode(".jpg", noise)[1].tobytes()
+        middle = len(whole) // 2
+        cut = whole[:middle] + whole[middle + 500 :]
+        works = jpeg.decode_jpeg(whole) is not None and jpeg.decode_jpeg(cut) is None
+    except Exception as error:
+        return Check("simplejpeg", "problem", f"self test failed ({error}): reinstall it")
+    if not works:
+        return Check("simplejpeg", "problem", "self test gave a wrong answer: reinstall it")
+    return Check("simplejpeg", "ok", "images that lost bytes are refused")
 
 
 def _kernels() -> Check:

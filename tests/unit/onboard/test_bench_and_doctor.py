@@ -12,6 +12,7 @@ from lanenet.data.camera_file import write_camera
 from lanenet.errors import ModelMismatchError
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.bench import example_camera, time_stages
+from lanenet.onboard.cameras import jpeg
 from lanenet.onboard.doctor.installation import check_camera, run_checks
 from lanenet.perception.edges import compiled
 from lanenet.perception.network.compact import network as compact
@@ -39,8 +40,8 @@ def test_bench_refuses_a_missing_model(tmp_path: Path) -> None:
 
 def test_this_installation_is_in_order() -> None:
     checks = {check.name: check for check in run_checks()}
-    expected = {"python", "lanenet", "packages", "extra train", "opencv", "compiled loops", "onnxruntime"}
-    assert expected <= set(checks)
+    expected = {"python", "lanenet", "packages", "extra train", "opencv", "simplejpeg", "compiled loops"}
+    assert expected | {"onnxruntime"} <= set(checks)
     assert [c for c in checks.values() if c.state == "problem"] == []
 
 
@@ -54,6 +55,13 @@ def test_broken_runtime_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "Canny", lambda *_: np.zeros((32, 32), np.uint8))
     states = {check.name: check.state for check in run_checks()}
     assert states["onnxruntime"] == "problem" and states["opencv"] == "problem"
+
+
+def test_it_says_whether_images_that_lost_bytes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jpeg, "decode_jpeg", lambda _: np.zeros((64, 64, 3), np.uint8))
+    assert {check.name: check.state for check in run_checks()}["simplejpeg"] == "problem"
+    monkeypatch.setattr(jpeg, "simplejpeg", None)
+    assert {check.name: check.state for check in run_checks()}["simplejpeg"] == "note"
 
 
 def test_it_says_whether_the_compiled_loops_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
