@@ -93,7 +93,10 @@ def run(case: Case, folder: Path) -> Result:
     process = sender('{"kind": "pca9685"}', log, environment)()
     guard = 0
     try:
-        guard = wire.wait(driving=True, after_s=0.0).process
+        try:
+            guard = wire.wait(driving=True, after_s=0.0).process
+        except AssertionError as error:
+            return Result(math.inf, None, log.read_text(errors="replace"), str(error))
         time.sleep(0.1 + case.moment / RATE_HZ)
         begin_s = time.monotonic()
         (folder / "outage.new").write_text(f"{begin_s + case.outage_s} {case.manner}")
