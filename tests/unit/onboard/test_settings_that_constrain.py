@@ -102,6 +102,9 @@ REFUSED: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     (("source.rate_hz=10", "safety={watchdog_s: 0.2}"),
      ("safety.max_age_s=0.1", "source.rate_hz=10", "0.1 s")),
     # The camera.
+    (("source.delay_s=0.1",), ("source.delay_s=0.1", "safety.max_age_s=0.1", "below 0.1 s")),
+    (("source={kind: v4l2, delay_s: 0.25}", "safety={max_age_s: 0.2}"),
+     ("source.delay_s=0.25", "safety.max_age_s=0.2")),
     (("source.silence_s=0.02",), ("source.silence_s=0.02", "source.rate_hz=30", "0.0333 s")),
     (("source.start_s=0.02",), ("source.start_s=0.02", "source.rate_hz=30", "0.0333 s")),
     (("source={kind: rpicam, codec: yuv420, width: 160}",),
@@ -129,6 +132,8 @@ TAKEN = [
     ("detector={kind: hough}", "camera=null", "control.own_target=true"),
     ("safety={stop_below: 0.5, slow_below: 0.5}",),
     ("source.rate_hz=10", "safety={watchdog_s: 0.12, max_age_s: 0.15}"),
+    ("source.delay_s=0.09",),
+    ("source={kind: rpicam, delay_s: 0.45}", "safety={max_age_s: 0.5}"),
     # To look at it.
     ("source={kind: replay, path: drive, rate_hz: 1}",),
 ]
