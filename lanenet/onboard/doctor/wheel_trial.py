@@ -16,9 +16,10 @@ from lanenet.config import parse_yaml
 from lanenet.errors import ConfigError, LanenetError, MotorMayRunError
 from lanenet.onboard.actuators.myconfig import with_myconfig
 from lanenet.onboard.actuators.pca9685 import PCA9685Settings
-from lanenet.onboard.actuators.pulses import MOST_TRIM, PulseSettings
+from lanenet.onboard.actuators.pulses import LEAST_TRAVEL_US, MOST_TRIM, PulseSettings
 from lanenet.onboard.drive import DriveSettings
 from lanenet.onboard.guard import CommandSink
+from lanenet.onboard.neutral import undisturbed
 
 _log = logging.getLogger(__name__)
 
@@ -53,7 +54,7 @@ class TrialResult:
 def try_wheels(settings: DriveSettings, sink: CommandSink, ask: Ask) -> TrialResult:
     """Turn the wheels and the motor, and ask what they did.
 
-    The motor is in neutral before and after, whatever happens in between.
+    Neutral is repeated until it is confirmed, whatever happens in between.
 
     Args:
         settings: The car's settings.
@@ -103,16 +104,24 @@ class _Holder:
         self._thread = threading.Thread(target=self._run, name="wheel trial", daemon=True)
 
     def __enter__(self) -> _Holder:
-        self._sink.open()
+        try:
+            self._sink.open()
+        except BaseException:
+            self.__exit__()
+            raise
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join(1.0)
-        left = self._sink.close()
+        with undisturbed():
+            self._end.set()
+            if self._thread.is_alive():
+                self._thread.join(1.0)
+            left = self._sink.close()
         if left is not None and left.confirmed is False:
             raise MotorMayRunError(left.may_run)
+        if left is not None and not left.confirmed:
+            _log.warning("%s", left.text)
 
     def hold(self, steering_rad: float, throttle: float) -> None:
         if self._failure is not None:
@@ -183,9 +192,7 @@ class _Trial:
             self._holder.hold(0.0, 0.0)
             self.result.changes["control.speed.throttle_at_rest"] = throttle
             if answer == "b":
-                self.result.changes["actuator.throttle_forward_us"] = self._pulses.throttle_reverse_us
-                self.result.changes["actuator.throttle_reverse_us"] = self._pulses.throttle_forward_us
-                self.result.lines.append("motor: it turned backward, its two pulses are exchanged")
+                self._turn_round()
             self.result.lines.append(f"motor: in the air it turns from a throttle of {throttle:.2f} on")
             return
         self._holder.hold(0.0, 0.0)
@@ -193,6 +200,19 @@ class _Trial:
             f"motor: did not turn up to a throttle of {max_throttle:g} (limits.max_throttle); is the speed "
             "controller switched on, and does it know this neutral (throttle_stopped_us)?"
         )
+
+    def _turn_round(self) -> None:
+        """Exchange the motor's pulses, if that of reverse is far enough from neutral to be the other."""
+        pulses = self._pulses
+        if abs(pulses.throttle_reverse_us - pulses.throttle_stopped_us) < LEAST_TRAVEL_US:
+            self.result.lines.append(
+                "motor: it turned backward, and the speed controller has no reverse (throttle_reverse_us) to "
+                "exchange with; set the direction at the speed controller, or exchange two wires of the motor"
+            )
+            return
+        self.result.changes["actuator.throttle_forward_us"] = pulses.throttle_reverse_us
+        self.result.changes["actuator.throttle_reverse_us"] = pulses.throttle_forward_us
+        self.result.lines.append("motor: it turned backward, its two pulses are exchanged")
 
 
 def set_values(text: str, changes: Mapping[str, float], where: str) -> str:

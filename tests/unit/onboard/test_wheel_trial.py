@@ -110,6 +110,16 @@ def test_motor_that_turns_backward_is_turned_round():
     assert command_pulses(mended(settings, result.changes), 0.0, 0.5).throttle_us == 1250.0
 
 
+@pytest.mark.parametrize("reverse_us", [1500.0, 1460.0])
+def test_a_motor_without_reverse_is_turned_round_at_the_speed_controller(reverse_us):
+    """Exchanged, the forward pulse would be neutral, or too close to it: a file that is refused."""
+    settings = settings_of(throttle_reverse_us=reverse_us)
+    car = Car(settings, longer_is_ahead=False)
+    result = try_wheels(settings, car, car.ask)
+    assert result.changes == {"control.speed.throttle_at_rest": 0.12}
+    assert any("backward" in line and "direction at the speed controller" in line for line in result.lines)
+
+
 def test_right_car_keeps_its_values():
     settings = settings_of()
     car = Car(settings)
