@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import struct
 import zlib
@@ -96,6 +97,12 @@ def is_folder(path: Path) -> bool:
         return stat.S_ISDIR(path.stat().st_mode)
     except (OSError, ValueError):
         return False
+
+
+def natural_key(name: object) -> list[tuple[int, int, str]]:
+    """Return the sort key of a name by which 2 comes before 10, as people count."""
+    parts = re.split(r"([0-9]+)", str(name))
+    return [(0, int(part), "") if k % 2 else (1, 0, part) for k, part in enumerate(parts)]
 
 
 @contextmanager

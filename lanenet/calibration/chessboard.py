@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.processes import in_threads
-from lanenet.reading import read_image
+from lanenet.reading import natural_key, read_image
 
 PICTURE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 #: Fewest rows and columns of corners of a board that is cut off. Chosen: 16 corners for the six numbers of a
@@ -108,7 +108,7 @@ def list_pictures(words: Sequence[str]) -> list[Path]:
             inside = [p for p in anchor.glob(pattern) if p.is_file()] if any(c in word for c in "*?[") else []
             if not inside:
                 raise CalibrationError(f"{word}: no such image, folder or pattern")
-        found += sorted(inside, key=_natural)
+        found += sorted(inside, key=natural_key)
     return list(dict.fromkeys(found))
 
 
@@ -282,8 +282,3 @@ def _hint(paths: Sequence[Path], board: Board) -> str:
         ):
             return f"; {path} seems to show one with {part[0]}x{part[1]}"
     return "; count the corners where four squares meet, not the squares"
-
-
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that puts 2 before 10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", str(path))]

@@ -24,7 +24,7 @@ from lanenet.cli.shared.options import (
 )
 from lanenet.cli.shared.viewing import NO_VIEWS, Views, with_viewers
 from lanenet.config import read_yaml
-from lanenet.errors import CalibrationError, counted
+from lanenet.errors import CalibrationError, DriveFormatError, counted
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import (
@@ -146,9 +146,22 @@ def detect(
             else None
         )
         progress = stack.enter_context(console.progress_bar(f"detect ({name})"))
-        report = run_detector(
-            opened, chosen, used_camera, out, video, progress, skip_unreadable=skip_unreadable, watch=watch
-        )
+        try:
+            report = run_detector(
+                opened,
+                chosen,
+                used_camera,
+                out,
+                video,
+                progress,
+                skip_unreadable=skip_unreadable,
+                watch=watch,
+            )
+        except DriveFormatError as error:
+            way_on = (
+                "" if skip_unreadable else "; --skip-unreadable leaves such frames out, with an empty row"
+            )
+            raise DriveFormatError(f"{error}{way_on}") from None
     console.show_problems(report.problems)
     console.say(
         f"{counted(report.frames, 'frame')}, {report.complete} with all six points, {report.steered} with a "
@@ -183,7 +196,6 @@ def detect(
 def _open(source: Path, *outs: Path | None) -> tuple[Source, Path | None]:
     """Open the frames; of a map those of its drive with its lane width, and the map, which has the camera."""
     from lanenet.data.drives.sources import open_source
-    from lanenet.errors import DriveFormatError
 
     if not any((source / name).is_file() for name in ("map.yaml", "refused.yaml")):
         return open_source(source), None

@@ -16,7 +16,7 @@ from lanenet.data.drives.folder import read_truth
 from lanenet.data.drives.recording import Commands, Drive, DriveFormat, assemble_drive
 from lanenet.errors import DriveFormatError, counted
 from lanenet.outputs import restore_output
-from lanenet.reading import is_folder
+from lanenet.reading import is_folder, natural_key
 
 __all__ = [
     "FORMATS",
@@ -67,7 +67,9 @@ def meant_instead(path: Path) -> str:
     if not path.exists():
         return _spelt_instead(path)
     if tub.is_old(path):
-        return "; a version 1 tub has to be converted by Donkeycar first"
+        new = shlex.quote(f"{path.name or 'tub'}_v2")
+        convert = f"python scripts/convert_to_tub_v2.py --tub={shlex.quote(str(path))} --output={new}"
+        return f"; a version 1 tub has to be converted by Donkeycar first, in its folder: {convert}"
     if path.suffix == ".bag":
         instead = f"rosbags-convert --src {shlex.quote(str(path))} --dst {shlex.quote(path.stem)}"
         return f"; a bag of ROS 1 has to be converted first: {instead}"
@@ -129,7 +131,7 @@ def drives_in(path: Path, depth: int) -> Iterator[Path]:
         depth: Folders deep in which drives are looked for.
     """
     try:
-        entries = sorted(path.iterdir()) if is_folder(path) else []
+        entries = sorted(path.iterdir(), key=natural_key) if is_folder(path) else []
     except OSError:  # a folder that cannot be read has no hint
         return
     yield from (entry for entry in entries if find_format(entry) is not None)

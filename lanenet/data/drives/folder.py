@@ -51,7 +51,8 @@ def read_folder(path: Path) -> RecordedFrames:
     table = inside.file(FRAMES_FILE, path, DriveFormatError)
     columns, commands = read_times(table, file=ColumnSpec("text"))
     frames = columns["frame"]
-    names = columns["file"].tolist()
+    # Tables of Windows.
+    names = [name.replace("\\", "/") for name in columns["file"].tolist()]
     images = ImageFiles(
         [
             inside.file(name, f"{table}: frame {number}, column 'file'", DriveFormatError)

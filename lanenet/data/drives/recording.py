@@ -30,6 +30,10 @@ from lanenet.reading import MAX_IMAGE, FolderFiles, decode_image, read_bytes
 #: A longer pause is a break: even a slow car has left the road that its last frame showed.
 MAX_PAUSE_S = 2.0
 
+#: A longer step within a session is a clock that was set, as that of a Raspberry Pi, which has no battery,
+#: once it finds a network. Chosen: a day, which no car drives on.
+_LEAP_S = 86_400.0
+
 #: What a drive can be on disk.
 Kind = Literal["folder", "tub", "video", "bag"]
 COMMAND_NAMES: tuple[str, ...] = ("speed_cm_s", "throttle", "steering_rad", "angle", "yaw_rate_rad_s")
@@ -285,19 +289,20 @@ def assemble_drive(path: Path, recorded: RecordedFrames) -> Drive:
             f"{path}: images of {width}x{height} px, but its camera file is for "
             f"{camera.width}x{camera.height} px"
         )
-    breaks = np.diff(r.t_s, prepend=r.t_s[:1]) > MAX_PAUSE_S
+    t_s, problems = _without_leaps(path, r)
+    breaks = np.diff(t_s, prepend=t_s[:1]) > MAX_PAUSE_S
     return Drive(
         name=path.resolve().name if path.is_dir() else path.stem,
         path=path,
         frames=r.frames,
-        t_s=r.t_s,
+        t_s=t_s,
         times_trusted=r.times_trusted,
         commands=r.commands,
         deleted=np.zeros(len(r.frames), dtype=bool) if r.deleted is None else r.deleted,
         breaks=breaks if r.sessions is None else breaks | r.sessions,
         camera=camera,
         lane_width_cm=file.lane_width_cm,
-        problems=r.problems,
+        problems=(*r.problems, *problems),
         width=width,
         height=height,
         images=r.images,
@@ -308,6 +313,24 @@ def assemble_drive(path: Path, recorded: RecordedFrames) -> Drive:
     )
 
 
+def _without_leaps(path: Path, recorded: RecordedFrames) -> tuple[Float[np.ndarray, "n"], list[str]]:
+    """Put a typical step where the clock was set forward; returns the times, and what was wrong."""
+    steps_s = np.diff(recorded.t_s)
+    leaps = steps_s > _LEAP_S
+    if recorded.sessions is not None:
+        leaps &= ~recorded.sessions[1:]
+    if not leaps.any():
+        return recorded.t_s, []
+    typical_s = float(np.median(steps_s[~leaps])) if not leaps.all() else MAX_PAUSE_S
+    t_s = recorded.t_s[0] + np.concatenate([[0.0], np.cumsum(np.where(leaps, typical_s, steps_s))])
+    first = int(np.flatnonzero(leaps)[0])
+    days = steps_s[first] / _LEAP_S
+    return t_s, [
+        f"{path}: the clock goes forward by a day or more {leaps.sum()} times, first by {days:.1f} days at "
+        f"frame {recorded.frames[first + 1]}; it was set, and a typical step is taken there"
+    ]
+
+
 class DriveFile(Settings):
     """What ``drive.yaml`` says about a drive.
 
@@ -316,7 +339,8 @@ class DriveFile(Settings):
         camera: Camera file in the folder.
         lane_width_cm: Distance between the middles of the two lines of the driven lane.
         max_steering_rad: Steering angle at Donkeycar's angle -1.
-        topics: Of a ROS 2 bag, those of the images and the commands to use; all if empty.
+        topics: Of a ROS 2 bag, those of the images and the commands to use; of a tub with several cameras,
+            the input of the one to use; all if empty.
         notes: Free text.
         licence: Under what the recording may be used, as in ``CC-BY-4.0``.
     """

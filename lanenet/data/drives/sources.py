@@ -21,10 +21,11 @@ from lanenet.data.drives import (
     meant_instead,
     open_drive,
 )
+from lanenet.data.drives.tub import is_old
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.static import find_static, spread_frames
-from lanenet.reading import read_image
+from lanenet.reading import natural_key, read_image
 
 #: Photos have no times; an annotated video shows one per second.
 PHOTO_RATE_HZ = 1.0
@@ -98,9 +99,10 @@ def open_source(path: Path) -> Source:
         raise DriveFormatError(f"{path}: no such file or folder")
     if find_format(path) is not None:
         return _recorded(path)
-    photos = sorted(path.iterdir()) if path.is_dir() else [path]
+    photos = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
     photos = [photo for photo in photos if is_photo(photo)]
-    if not photos:
+    # Images of a recording are none: they have times, commands and an order.
+    if not photos or is_old(path):
         raise DriveFormatError(
             f"{path}: expected {formats_text()}, or photos ({', '.join(PHOTO_ENDINGS)}), found none of them"
             f"{meant_instead(path)}"

@@ -8,29 +8,18 @@ of catalogs), catalogs of one JSON record per line, and a folder ``images``. Sou
 from __future__ import annotations
 
 import itertools
-import json
-import math
 import os
-import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lanenet.data.drives.recording import (
-    DRIVE_FILE,
-    MAX_TIME_S,
-    Commands,
-    DriveFormat,
-    ImageFiles,
-    RecordedFrames,
-)
+from lanenet.data.drives.recording import DRIVE_FILE, Commands, DriveFormat, ImageFiles, RecordedFrames
+from lanenet.data.drives.tub_index import CATALOGS, MANIFEST_FILE, read_index
+from lanenet.data.drives.tub_rows import Record, ordered, read_catalog
 from lanenet.errors import DriveFormatError
-from lanenet.reading import MAX_JSON, MEBIBYTE, FolderFiles, is_regular, parsing, read_bytes, read_text
+from lanenet.reading import FolderFiles, is_regular
 
-MANIFEST_FILE = "manifest.json"
 #: Used where the timestamps cannot be those of the frames: Donkeycar's default rate (DRIVE_LOOP_HZ = 20).
 DEFAULT_PERIOD_S = 0.05
 #: Timestamps closer than this are not those of the frames, and share of such steps above which none is used.
@@ -41,72 +30,51 @@ _MIN_STEP_S, _SHORT_SHARE = 0.01, 0.2
 #: Share of the steps in which the clock may stand or go back, one in any case: it was set. Chosen.
 _SET_SHARE = 0.01
 
-#: Of a catalog. Chosen: Donkeycar starts a new one every 1000 rows, which take 0.3 MB, or more with a lidar.
-_MAX_CATALOG = 64 * MEBIBYTE
-#: Characters of a row. Chosen: 50 000 numbers; lists in JSON take twenty times their text in memory.
-_MAX_ROW = 2**20
-#: Rows are counted in 64 bits; chosen: exact as a float, too.
-_MAX_INDEX = 2**53
-#: A joystick at its stop: Donkeycar divides its 16 bits, -32768 to 32767, by 32767. Taken as 1.
-_LARGEST_COMMAND = 32768.0 / 32767.0 + 1e-9
-_MAX_FLOAT = sys.float_info.max
-
-
-@dataclass(frozen=True)
-class _Record:
-    index: int
-    session: str
-    time_ms: float
-    image: str
-    angle: float
-    throttle: float
-
 
 def read_tub(path: Path) -> RecordedFrames:
     """Read a tub; nothing is copied or converted.
 
-    Rows that cannot be used (not JSON, no index, no image) are left out and counted in ``problems``. Rows
-    without an angle stay, with NaN, as do those whose angle or throttle lies outside -1 to 1.
+    What the catalogs hold is read, whether the manifest lists it or not. Rows that cannot be used (not JSON,
+    no index, no image) are left out and counted in ``problems``. Rows without an angle stay, with NaN, as do
+    those whose angle or throttle lies outside -1 to 1.
 
     Raises:
-        DriveFormatError: If the manifest or all catalogs cannot be read, or no row can be used.
+        DriveFormatError: If all catalogs cannot be read, there are several cameras, or no row can be used.
     """
     inside = FolderFiles(path)
-    catalogs, deleted, image_key = _read_manifest(inside.file(MANIFEST_FILE, path, DriveFormatError))
-    key = f"{path / MANIFEST_FILE}: key 'paths'"
-    present = [name for name in catalogs if is_regular(inside.file(name, key, DriveFormatError))]
-    absent = [name for name in catalogs if name not in present]
-    if not present:
-        found = f"{', '.join(absent)} are not there" if absent else "the manifest lists no catalog"
-        raise DriveFormatError(f"{path / MANIFEST_FILE}: the tub is empty: {found}")
-    problems: list[str] = []
-    if absent:
-        problems.append(f"{path / MANIFEST_FILE}: catalogs listed but not there: {', '.join(absent)}")
-    records: list[_Record] = []
-    for name in present:
-        found_records, bad_rows = _read_catalog(path / name, image_key)
-        records += found_records
+    index = read_index(path, inside)
+    problems = index.problems
+    rows: list[Record] = []
+    for catalog in index.catalogs:
+        found_records, bad_rows = read_catalog(catalog, index.image_key)
+        rows += found_records
         if bad_rows:
             problems.append(
-                f"{path / name}: {len(bad_rows)} rows are not JSON with '_index' and {image_key!r} "
+                f"{catalog}: {len(bad_rows)} rows are not JSON with '_index' and {index.image_key!r} "
                 f"(first: row {bad_rows[0]})"
             )
-    ordered = _in_order(records)
-    if len(ordered) < len(records):
-        problems.append(f"{path}: {len(records) - len(ordered)} rows repeat an earlier index or go back")
+    sequence = ordered(rows)
+    problems += [f"{path}: {problem}" for problem in sequence.problems]
+    if sequence.recounted and index.deleted:
+        problems.append(
+            f"{path}: which {len(index.deleted)} frames were deleted cannot be told by their numbers"
+        )
     folder = path / "images"
-    there = _image_names(folder, inside)
-    missing = [record for record in ordered if record.image not in there]
+    names = _image_names(folder, inside)
+    files = [_image_file(path, record.image, names, inside) for record in sequence.records]
+    missing = [k for k, file in enumerate(files) if file is None]
     if missing:
         problems.append(
-            f"{folder}: {len(missing)} of {len(ordered)} images are missing (first: frame "
-            f"{missing[0].index}, {missing[0].image})"
+            f"{folder}: {len(missing)} of {len(files)} images are missing (first: frame "
+            f"{sequence.frames[missing[0]]}, {sequence.records[missing[0]].image})"
         )
-    records = [record for record in ordered if record.image in there]
+    kept = [k for k, file in enumerate(files) if file is not None]
+    images = [file for file in files if file is not None]
+    records = [sequence.records[k] for k in kept]
     if not records:
         detail = f" ({'; '.join(problems)})" if problems else ""
         raise DriveFormatError(f"{path}: the tub holds no usable frames{detail}")
-    frames = np.array([record.index for record in records], dtype=np.int64)
+    frames = sequence.frames[kept]
     time_ms = np.array([record.time_ms for record in records])
     distrust = _distrust(frames, time_ms)
     if distrust is not None:
@@ -145,10 +113,12 @@ def read_tub(path: Path) -> RecordedFrames:
             angle=None if np.isnan(angle).all() else angle,
             throttle=None if np.isnan(throttle).all() else throttle,
         ),
-        ImageFiles([folder / record.image for record in records]),
+        ImageFiles(images),
         tuple(problems),
         times_trusted=distrust is None,
-        deleted=np.array([record.index in deleted for record in records], dtype=bool),
+        deleted=np.array(
+            [not sequence.recounted and record.index in index.deleted for record in records], dtype=bool
+        ),
         sessions=np.array([False, *(before != now for before, now in sessions)]),
     )
 
@@ -156,7 +126,7 @@ def read_tub(path: Path) -> RecordedFrames:
 FORMAT = DriveFormat(
     kind="tub",
     described=f"a Donkeycar tub ({MANIFEST_FILE})",
-    recognises=lambda path: is_regular(path / MANIFEST_FILE),
+    recognises=lambda path: is_regular(path / MANIFEST_FILE) or any(path.glob(CATALOGS)),
     read=read_tub,
     files=(MANIFEST_FILE, DRIVE_FILE, "*.catalog", "*.catalog_manifest"),
 )
@@ -165,32 +135,6 @@ FORMAT = DriveFormat(
 def is_old(path: Path) -> bool:
     """Tell whether a folder is a tub of version 1, which is not read."""
     return any(path.glob("record_*.json"))
-
-
-def _read_manifest(path: Path) -> tuple[list[str], set[int], str]:
-    """Return the names of the catalogs, the deleted indexes, and the key of the images."""
-    lines = [line for line in read_text(path, DriveFormatError, MAX_JSON).split("\n") if line.strip()]
-    with parsing(f"{path}: not a readable tub manifest", DriveFormatError):
-        return _manifest_of(path, [json.loads(line) for line in lines])
-
-
-def _manifest_of(path: Path, values: list[Any]) -> tuple[list[str], set[int], str]:
-    catalogs = [value for value in values if isinstance(value, dict) and "paths" in value]
-    if not catalogs or not isinstance(catalogs[-1]["paths"], list):
-        raise DriveFormatError(
-            f"{path}: expected five lines of JSON, the last with the catalogs' 'paths', found {len(values)}"
-        )
-    deleted = catalogs[-1].get("deleted_indexes", [])
-    if not isinstance(deleted, list) or not all(isinstance(index, int) for index in deleted):
-        raise DriveFormatError(f"{path}: expected 'deleted_indexes' to be a list of whole numbers")
-    image_key = "cam/image_array"
-    if len(values) > 1 and isinstance(values[0], list) and isinstance(values[1], list):
-        named = dict(zip(values[1], values[0], strict=False)) if len(values[0]) == len(values[1]) else {}
-        image_key = str(named.get("image_array", image_key))
-    # macOS adds a "._name" beside each file that it copies.
-    names = [str(name) for name in catalogs[-1]["paths"] if not Path(str(name)).name.startswith("._")]
-    # Once each: a catalog that is listed a million times is still one.
-    return list(dict.fromkeys(names)), set(deleted), image_key
 
 
 def _image_names(folder: Path, inside: FolderFiles) -> set[str]:
@@ -212,69 +156,24 @@ def _image_names(folder: Path, inside: FolderFiles) -> set[str]:
     return names
 
 
-def _read_catalog(path: Path, image_key: str) -> tuple[list[_Record], list[int]]:
-    """Return the records of a catalog and the numbers of the rows that are none.
+def _image_file(path: Path, name: str, names: set[str], inside: FolderFiles) -> Path | None:
+    """Return the file of an image; None if it is not there.
 
-    A power cut leaves zero bytes and half a row behind; they count as bad rows.
+    Args:
+        path: The tub.
+        name: What a row names; tools write folders before it, also those of another computer.
+        names: Names in the tub's folder of images.
+        inside: The tub's files.
+
+    Raises:
+        DriveFormatError: If a link leads out of the tub.
     """
-    data = read_bytes(path, DriveFormatError, _MAX_CATALOG)
-    records: list[_Record] = []
-    bad_rows: list[int] = []
-    for number, line in enumerate(data.decode("utf-8", errors="replace").split("\n"), start=1):
-        record = _record(line, image_key) if len(line) <= _MAX_ROW else None
-        if record is not None:
-            records.append(record)
-        elif line and not line.isspace():
-            bad_rows.append(number)
-    return records, bad_rows
-
-
-def _record(line: str, image_key: str) -> _Record | None:
-    if not line.lstrip().startswith("{"):
-        return None
-    try:
-        data = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(data, dict):
-        return None
-    index, image = data.get("_index"), data.get(image_key)
-    if not isinstance(index, int) or isinstance(index, bool) or not isinstance(image, str):
-        return None
-    if not image or Path(image).name != image or not 0 <= index <= _MAX_INDEX:
-        return None
-    # In the pilot's drive modes the pilot's commands moved the car, not the user's.
-    mode = data.get("user/mode")
-    return _Record(
-        index=index,
-        session=str(data.get("_session_id")),
-        time_ms=_number(data.get("_timestamp_ms"), 1000.0 * MAX_TIME_S),
-        image=image,
-        angle=_command(data, "angle", mode in ("local", "local_angle")),
-        throttle=_command(data, "throttle", mode == "local"),
-    )
-
-
-def _command(data: dict[str, Any], name: str, by_pilot: bool) -> float:
-    pilot = _number(data.get(f"pilot/{name}"))
-    value = pilot if by_pilot and math.isfinite(pilot) else _number(data.get(f"user/{name}"))
-    return math.copysign(1.0, value) if 1.0 < abs(value) <= _LARGEST_COMMAND else value
-
-
-def _number(value: Any, most: float = math.inf) -> float:
-    # Whole numbers of any length are JSON.
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= most:
-        return math.nan
-    return float(value) if abs(value) <= _MAX_FLOAT else math.nan
-
-
-def _in_order(records: list[_Record]) -> list[_Record]:
-    """Leave out records whose index repeats or goes back."""
-    kept: list[_Record] = []
-    for record in records:
-        if not kept or record.index > kept[-1].index:
-            kept.append(record)
-    return kept
+    pure = PurePosixPath(name)
+    if not pure.is_absolute() and ".." not in pure.parts and len(pure.parts) > 1:
+        for below in (name, f"images/{name}"):
+            if is_regular(file := inside.file(below, path, DriveFormatError)):
+                return file
+    return path / "images" / pure.name if pure.name in names else None
 
 
 def _distrust(frames: Int[np.ndarray, "n"], time_ms: Float[np.ndarray, "n"]) -> str | None:

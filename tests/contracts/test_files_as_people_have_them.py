@@ -1,0 +1,315 @@
+"""Recordings as people have them: what is read of them, and what is said.
+
+The kinds are those of public reports; docs/formats.md has the table of what is done.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from commands import refused
+from drives import frame_image, record, write_drive, write_tub
+from typer.testing import CliRunner
+
+from lanenet.cli.app import app
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.sources import open_source
+from lanenet.errors import DriveFormatError
+
+CASES = Path(__file__).resolve().parents[1] / "support/cases"
+Make = Callable[[Path], Path]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A source and what is expected of it.
+
+    Attributes:
+        name: What people have.
+        make: Makes it in a folder and returns its path.
+        frames: Frame numbers that are read; none if it is refused.
+        words: Words of the problems, or of the refusal.
+    """
+
+    name: str
+    make: Make
+    frames: list[int]
+    words: tuple[str, ...] = ()
+
+    def check(self, folder: Path) -> Any:
+        if not self.frames:
+            with pytest.raises(DriveFormatError) as caught:
+                open_source(self.make(folder)).image(0)
+            said = str(caught.value)
+            assert "\n" not in said
+        else:
+            source = open_source(self.make(folder))
+            assert source.frames.tolist() == self.frames
+            for i in range(len(source)):
+                assert source.image(i).ndim == 3
+            said = "; ".join(source.problems)
+            assert bool(said) == bool(self.words), said
+        for word in self.words:
+            assert word in said
+
+
+def table(cases: list[Case]) -> Any:
+    assert len({case.name for case in cases}) == len(cases)
+    return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
+
+
+def number(image: np.ndarray) -> int:
+    """The number that :func:`frame_image` paints, below 13."""
+    return round(float(image[..., 0].mean()) / 20)
+
+
+# Tubs: the catalogs hold the drive, the manifest may be anything.
+
+
+def tub_case(name: str) -> Make:
+    """A tub of another project, with images of our own in the places of its own."""
+
+    def make(folder: Path) -> Path:
+        path = shutil.copytree(CASES / name, folder / "tub")
+        (path / "images").mkdir()
+        k = 0
+        for catalog in sorted(path.glob("*.catalog")):
+            for line in catalog.read_text().splitlines():
+                for value in json.loads(line).values():
+                    if str(value).endswith(".jpg"):
+                        cv2.imwrite(str(path / "images" / value), frame_image(k))
+                k += 1
+        return path
+
+    return make
+
+
+def tub(
+    edit: Callable[[Path], None] = lambda path: None,
+    rows: list[Any] | None = None,
+    deleted: list[int] | None = None,
+    per_catalog: int = 4,
+) -> Make:
+    """A tub of eight frames in two catalogs, changed."""
+
+    def make(folder: Path) -> Path:
+        path = write_tub(folder / "tub", rows or [record(k) for k in range(8)], deleted, per_catalog)
+        edit(path)
+        return path
+
+    return make
+
+
+def stale(path: Path) -> None:
+    text = (path / "manifest.json").read_text()
+    (path / "manifest.json").write_text(text.replace(', "catalog_1.catalog"', ""))
+
+
+def listed_as_text(path: Path) -> None:
+    *lines, last = (path / "manifest.json").read_text().splitlines()
+    about = json.loads(last)
+    about["paths"] = sorted(about["paths"])
+    (path / "manifest.json").write_text("\n".join([*lines, json.dumps(about)]))
+
+
+def in_windows(path: Path) -> None:
+    text = (path / "manifest.json").read_text()
+    (path / "manifest.json").write_text(text.replace("catalog_", "data\\\\catalog_"))
+    (path / "data").mkdir()
+    for catalog in path.glob("*.catalog"):
+        catalog.rename(path / "data" / catalog.name)
+
+
+def version_1(folder: Path) -> Path:
+    for k in range(12):
+        cv2.imwrite(str(folder / f"{k}_cam-image_array_.jpg"), frame_image(k))
+        (folder / f"record_{k}.json").write_text("{}")
+    return folder
+
+
+def with_image(k: int, name: str, **more: Any) -> dict[str, Any]:
+    return record(k, **{"cam/image_array": name}, **more)
+
+
+def in_folders(folder: Path) -> Path:
+    """Images in a folder for each session, with the same names in both."""
+    names = [f"{'ab'[k // 2]}/{k % 2}.jpg" for k in range(4)]
+    path = write_tub(folder / "tub", [])
+    rows = [json.dumps(with_image(k, name)) for k, name in enumerate(names)]
+    (path / "catalog_0.catalog").write_text("\n".join(rows))
+    for k, name in enumerate(names):
+        (path / "images" / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path / "images" / name), frame_image(k))
+    return path
+
+
+def renamed_in_rows(before: str) -> Make:
+    """A tub whose rows name each image with a folder before it."""
+
+    def edit(path: Path) -> None:
+        for catalog in path.glob("*.catalog"):
+            text = catalog.read_text().replace('array": "', f'array": "{before}')
+            catalog.write_text(text)
+
+    return tub(edit)
+
+
+EIGHT = list(range(8))
+DAY_MS = 86_400_000
+TUBS = [
+    Case(
+        "a manifest that was cut",
+        tub_case("tub_manifest_cut"),
+        list(range(10)),
+        ("line 5 is torn", "deleted"),
+    ),
+    Case("rows counted anew in each catalog", tub_case("tub_local_index"), list(range(10)), ("begins anew",)),
+    Case(
+        "two cameras",
+        tub_case("tub_two_cameras"),
+        [],
+        ("cam/image_array_a, cam/image_array_b", "drive.yaml", "topics: [cam/image_array_a]"),
+    ),
+    Case("a manifest that lists half", tub(stale), EIGHT, ("does not list catalog_1.catalog",)),
+    Case("no manifest", tub(lambda path: (path / "manifest.json").unlink()), EIGHT, ("not there",)),
+    Case(
+        "an empty manifest", tub(lambda path: (path / "manifest.json").write_bytes(b"")), EIGHT, ("is empty",)
+    ),
+    Case(
+        "a zeroed manifest",
+        tub(lambda path: (path / "manifest.json").write_bytes(bytes(300))),
+        EIGHT,
+        ("empty",),
+    ),
+    Case("a manifest of one line less", tub(lambda path: edit_lines(path, -1)), EIGHT, ("five lines",)),
+    Case("a manifest without its first lines", tub(lambda path: edit_lines(path, 3)), EIGHT),
+    Case(
+        "an index with a flipped bit",
+        tub(rows=[record(k, _index=k + (2**20 if k == 2 else 0)) for k in range(8)]),
+        [0, 1, 3, 4, 5, 6, 7],
+        ("1 rows repeat",),
+    ),
+    Case(
+        "two tubs in one catalog",
+        tub(rows=[with_image(k % 4, f"{k}.jpg", _timestamp_ms=50 * k) for k in range(8)], per_catalog=8),
+        EIGHT,
+        ("begins anew, first after frame 3",),
+    ),
+    Case(
+        "deleted frames by numbers that occur twice",
+        tub(rows=[with_image(k % 4, f"{k}.jpg", _timestamp_ms=50 * k) for k in range(8)], deleted=[1]),
+        EIGHT,
+        ("begins anew", "which 1 frames were deleted cannot be told"),
+    ),
+    Case(
+        "catalogs listed in the order of text",
+        tub(listed_as_text, [record(k) for k in range(24)], per_catalog=2),
+        list(range(24)),
+    ),
+    Case("a tub of Windows", tub(in_windows), EIGHT),
+    Case("images named with their folder", renamed_in_rows("images/"), EIGHT),
+    Case("images named as on the car", renamed_in_rows("/home/pi/mycar/data/tub_1/images/"), EIGHT),
+    Case("images named as in Windows", renamed_in_rows("C:\\\\mycar\\\\data\\\\images\\\\"), EIGHT),
+    Case("images in folders", in_folders, [0, 1, 2, 3]),
+    Case(
+        "a clock set forward by 40 days",
+        tub(rows=[record(k, _timestamp_ms=50 * k + (40 * DAY_MS if k > 3 else 0)) for k in range(8)]),
+        EIGHT,
+        ("the clock goes forward", "40.0 days at frame 4"),
+    ),
+    Case("a tub of version 1", version_1, [], ("version 1", "convert_to_tub_v2.py --tub=", "--output=")),
+]
+
+
+def edit_lines(path: Path, first: int) -> None:
+    """Leave the lines of a manifest from one on; all but the last for -1."""
+    lines = (path / "manifest.json").read_text().splitlines()
+    kept = lines[:-1] if first < 0 else lines[first:]
+    (path / "manifest.json").write_text("\n".join(kept) + "\n")
+
+
+@table(TUBS)
+def test_tubs(tmp_path: Path, case: Case) -> None:
+    case.check(tmp_path)
+
+
+def test_the_order_of_a_tub_is_that_of_its_catalogs(tmp_path: Path) -> None:
+    source = open_source(tub_case("tub_local_index")(tmp_path))
+    assert [number(source.image(i)) for i in range(10)] == list(range(10))
+    np.testing.assert_allclose(source.t_s, 0.05 * np.arange(10), atol=1e-9)
+    source = open_source(in_folders(tmp_path / "folders"))
+    assert [number(source.image(i)) for i in range(4)] == [0, 1, 2, 3]
+
+
+def test_of_two_cameras_the_one_that_is_named_is_read(tmp_path: Path) -> None:
+    path = tub_case("tub_two_cameras")(tmp_path)
+    rear = np.zeros((48, 64, 3), np.uint8)
+    for k in range(10):
+        cv2.imwrite(str(path / "images" / f"{k}_cam_image_array_b_.jpg"), rear)
+    for topic, mean in (("a", 20.0), ("b", 0.0)):
+        (path / "drive.yaml").write_text(f"format: lanenet-drive/1\ntopics: [cam/image_array_{topic}]\n")
+        assert open_drive(path).image(1)[..., 0].mean() == pytest.approx(mean, abs=2.0)
+    (path / "drive.yaml").write_text("format: lanenet-drive/1\ntopics: [cam/other]\n")
+    with pytest.raises(DriveFormatError, match=r"'topics': found cam/other, expected one of .*_a, .*_b"):
+        open_drive(path)
+
+
+@pytest.mark.parametrize("kind", ["tub", "folder"])
+def test_a_clock_that_was_set_forward_is_no_break(tmp_path: Path, kind: str) -> None:
+    ahead = 40 * DAY_MS
+    if kind == "tub":
+        rows = [record(k, _timestamp_ms=50 * k + (ahead if k > 3 else 0)) for k in range(8)]
+        drive = open_drive(write_tub(tmp_path / "tub", rows))
+    else:
+        path = write_drive(tmp_path / "lap", 8)
+        lines = (path / "frames.csv").read_text().splitlines()
+        for k in range(4, 8):
+            cells = lines[k + 1].split(",")
+            cells[2] = str(float(cells[2]) + ahead / 1000)
+            lines[k + 1] = ",".join(cells)
+        (path / "frames.csv").write_text("\n".join(lines) + "\n")
+        drive = open_drive(path)
+    np.testing.assert_allclose(drive.t_s, 0.05 * np.arange(8), atol=1e-6)
+    assert not drive.breaks.any() and "40.0 days" in drive.problems[0]
+    # A day later in another session is another day.
+    rows = [
+        record(k, _session_id=str(k > 3), _timestamp_ms=50 * k + (ahead if k > 3 else 0)) for k in range(8)
+    ]
+    assert np.flatnonzero(open_drive(write_tub(tmp_path / "two", rows)).breaks).tolist() == [4]
+
+
+def test_a_table_of_windows_names_its_images(tmp_path: Path) -> None:
+    path = write_drive(tmp_path / "lap", 3)
+    text = (path / "frames.csv").read_text()
+    (path / "frames.csv").write_text(text.replace("images/", "images\\"))
+    drive = open_drive(path)
+    assert not drive.problems and number(drive.image(2)) == 2
+
+
+def test_an_unreadable_image_names_the_option_that_goes_on(tmp_path: Path) -> None:
+    path = write_drive(tmp_path / "lap", 3)
+    (path / "images" / "000002.jpg").write_bytes(b"")
+    out = tmp_path / "lanes.csv"
+    words = ["detect", str(path), "--detector", "hough", "--out", str(out)]
+    line = refused(tmp_path, *words)
+    assert "000002.jpg: the image file is empty" in line and "--skip-unreadable" in line
+    assert CliRunner().invoke(app, [*words, "--skip-unreadable"]).exit_code == 0
+    assert len(out.read_text().splitlines()) == 4
+
+
+# Photos.
+
+
+def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for k in range(12):
+        cv2.imwrite(str(tmp_path / f"frame{k}.jpg"), frame_image(k))
+    source = open_source(tmp_path)
+    assert [number(source.image(i)) for i in range(12)] == list(range(12))
