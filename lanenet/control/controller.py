@@ -94,6 +94,11 @@ def throttle_of(speed_cm_s: float, settings: SpeedSettings) -> float:
     return min(1.0, settings.throttle_at_rest + speed_cm_s / settings.cm_s_per_throttle)
 
 
+def speed_of_cm_s(throttle: float, settings: SpeedSettings) -> float:
+    """Return the speed of a car at a throttle; 0 where it does not roll. What reverses is not known."""
+    return max(0.0, (throttle - settings.throttle_at_rest) * settings.cm_s_per_throttle)
+
+
 class ControlSettings(Settings):
     """From the lane to steering and speed.
 

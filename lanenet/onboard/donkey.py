@@ -9,10 +9,13 @@ A pilot in ``manage.py``, in place of a trained model::
     V.add(LanePilot.from_file("lanenet.yaml"), inputs=["cam/image_array"],
           outputs=["pilot/angle", "pilot/throttle"], run_condition="run_pilot")
 
-The ``cv_control`` template needs lines in ``myconfig.py`` only::
+The ``cv_control`` template needs lines in ``myconfig.py`` only (``docs/raspberry_pi.md``)::
 
     CV_CONTROLLER_MODULE = "lanenet.onboard.donkey"
     CV_CONTROLLER_CLASS = "CvLaneController"
+    CV_CONTROLLER_INPUTS = ["cam/image_array", "user/mode", "steering", "throttle"]
+    CV_CONTROLLER_OUTPUTS = ["pilot/steering", "pilot/throttle", "ui/image_array"]
+    CV_CONTROLLER_CONDITION = None
     LANENET_CONFIG = "/home/pi/mycar/lanenet.yaml"
 
 A transformer for training and driving, here the bird's-eye view::
@@ -38,7 +41,7 @@ from jaxtyping import Num, UInt8
 from pydantic import Field
 
 from lanenet.config import Rule, Settings, check_settings, load_settings
-from lanenet.control.controller import ControlSettings, LaneController, throttle_of
+from lanenet.control.controller import ControlSettings, LaneController, speed_of_cm_s, throttle_of
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives.sources import read_mask
 from lanenet.errors import ConfigError
@@ -58,9 +61,11 @@ log = logging.getLogger(__name__)
 
 #: Share of the speed that is left when the camera seems to have moved; chosen, as for ``lanenet drive``.
 _SLOW_SHARE = 0.5
-#: Donkeycar calls its pilot in every turn of its loop (20 Hz by default) unless a person drives: after a
-#: longer silence a person drove.
+#: Donkeycar calls its pilot in every turn of its loop (20 Hz by default), most templates not while a person
+#: drives: after a longer silence a person drove.
 _PAUSE_S = 0.5
+#: Donkeycar's drive modes in which the throttle is not the pilot's.
+_PERSON_HAS_THROTTLE = ("user", "local_angle")
 
 
 class DonkeySettings(Settings):
@@ -142,6 +147,7 @@ class LanePilot:
         self._repeats = RepeatCheck()
         self._run_s = self._seen_s = -math.inf
         self._target = (0.0, 0.0)
+        self._speed_cm_s = 0.0
 
     @staticmethod
     def from_file(path: str | Path) -> LanePilot:
@@ -152,6 +158,29 @@ class LanePilot:
         """
         path = Path(path).expanduser()
         return LanePilot(load_settings(DonkeySettings, path), path.parent)
+
+    def take_over(self) -> None:
+        """Begin anew where a person drove: the throttle rises from 0, and no earlier lane is continued."""
+        self._begin(self._clock())
+
+    def _begin(self, now_s: float) -> None:
+        self._limiter.neutral(now_s)
+        self._detector.reset()
+        self._controller.reset()
+        self._target, self._seen_s = (self._target[0], 0.0), -math.inf
+        self._finding = Finding()
+        if self._check is not None:
+            self._check.reset()
+
+    def moved_by(self, angle: float, throttle: float) -> None:
+        """Take the command that moved the car since the last image, where it was not the pilot's own.
+
+        Args:
+            angle: Donkeycar's, -1 (left) to 1 (right).
+            throttle: Donkeycar's, -1 to 1.
+        """
+        self._limiter.start_from(-angle * self._settings.limits.max_steering_rad, throttle)
+        self._speed_cm_s = speed_of_cm_s(throttle, self._settings.control.speed)
 
     def run(self, image_rgb: Num[np.ndarray, "h w *c"] | None) -> tuple[float, float]:
         """Return the command for an image.
@@ -164,13 +193,7 @@ class LanePilot:
         """
         now_s = self._clock()
         if now_s - self._run_s > _PAUSE_S:
-            # A person drove meanwhile: the throttle starts from 0, and the lane memory is out of date.
-            self._limiter.neutral(now_s)
-            self._detector.reset()
-            self._controller.reset()
-            self._finding = Finding()
-            if self._check is not None:
-                self._check.reset()
+            self._begin(now_s)
         self._run_s = now_s
         if image_rgb is None:
             self.estimate = LaneEstimate()
@@ -178,21 +201,21 @@ class LanePilot:
             # A copy, since some of Donkeycar's cameras reuse one array.
             bgr = _bgr_of(image_rgb)
             if self._settings.allow_repeated_frames or not self._repeats.fault_of(bgr):
-                motion = self._target[1], self._limiter.steering_rad
+                motion = self._speed_cm_s, self._limiter.steering_rad
                 self._controller.tell(self._detector, now_s, *motion)
                 self.estimate = self._detector.detect(bgr)
                 self._look_at_camera(bgr, now_s)
                 self._follow(now_s)
         if now_s - self._seen_s > self._settings.hold_s:
             self._target = (self._target[0], 0.0)
-        steering_rad, speed_cm_s = self._target
-        throttle = throttle_of(speed_cm_s, self._settings.control.speed)
+        steering_rad, self._speed_cm_s = self._target
+        throttle = throttle_of(self._speed_cm_s, self._settings.control.speed)
         steering_rad, throttle = self._limiter.limit(steering_rad, throttle, now_s)
         # Donkeycar's sign: -1 is left.
         return -steering_rad / self._settings.limits.max_steering_rad, throttle
 
     def _follow(self, now_s: float) -> None:
-        target = self._controller.target(self.estimate, now_s, self._target[1], self._limiter.steering_rad)
+        target = self._controller.target(self.estimate, now_s, self._speed_cm_s, self._limiter.steering_rad)
         if self.estimate.confidence >= self._settings.min_confidence and math.isfinite(target.steering_rad):
             if self._finding.concern is Concern.STOP:
                 return
@@ -233,7 +256,9 @@ def _bgr_of(image: Num[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
 class CvLaneController:
     """The pilot as a controller for the ``cv_control`` template, which passes a PID controller and ``cfg``.
 
-    The PID controller is not used: steering follows from the geometry of the lane.
+    The PID controller is not used: steering follows from the geometry of the lane. Called in every drive
+    mode, the part shows the lane before the car follows it, and learns from mode and commands what moved the
+    car.
     """
 
     def __init__(self, pid: Any, cfg: Any) -> None:
@@ -247,11 +272,29 @@ class CvLaneController:
             raise ConfigError("myconfig.py: LANENET_CONFIG is missing, expected the path of a pilot's YAML")
         self.pilot = LanePilot.from_file(path)
         self._overlay = bool(getattr(cfg, "OVERLAY_IMAGE", False))
+        self._mode_before: str | None = "user"
 
     def run(
-        self, cam_img: Num[np.ndarray, "h w *c"] | None
+        self,
+        cam_img: Num[np.ndarray, "h w *c"] | None,
+        mode: str | None = "local",
+        angle_before: float | None = None,
+        throttle_before: float | None = None,
     ) -> tuple[float, float, Num[np.ndarray, "h w *d"] | None]:
-        """Return angle, throttle, and the image with the detected lane drawn into it."""
+        """Return angle, throttle, and the image with the detected lane drawn into it.
+
+        Args:
+            cam_img: Donkeycar's image.
+            mode: ``user``, ``local_angle`` (the pilot steers, a person has the throttle), or another one, in
+                which the pilot drives.
+            angle_before: Angle that moved the car since the last image; None before the first command.
+            throttle_before: Throttle that did.
+        """
+        if self._mode_before in _PERSON_HAS_THROTTLE:
+            self.pilot.moved_by(angle_before or 0.0, throttle_before or 0.0)
+        if self._mode_before == "user" and mode != "user":
+            self.pilot.take_over()
+        self._mode_before = mode
         angle, throttle = self.pilot.run(cam_img)
         if cam_img is None or not self._overlay:
             return angle, throttle, cam_img

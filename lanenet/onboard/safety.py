@@ -209,6 +209,12 @@ class CommandLimiter:
         """Note that the motor is in neutral: from now the throttle rises from 0 again."""
         self.throttle, self._throttled_s = 0.0, now_s
 
+    def start_from(self, steering_rad: float, throttle: float) -> None:
+        """Take what is in force in place of the last command, as when a person drives."""
+        s = self._settings
+        self.steering_rad = min(max(steering_rad, -s.max_steering_rad), s.max_steering_rad)
+        self.throttle = min(max(throttle, 0.0), s.max_throttle)
+
 
 def _since(before_s: float, now_s: float) -> float:
     return max(0.0, now_s - before_s) if math.isfinite(before_s) else 0.0

@@ -89,6 +89,21 @@ def test_the_pilots_commands_count_when_the_pilot_drove(tmp_path: Path) -> None:
     np.testing.assert_allclose(drive.commands.throttle, [0.0, 0.01, 0.9])
 
 
+def test_what_moved_the_car_counts_in_tubs_of_the_template_cv_control(tmp_path: Path) -> None:
+    """It writes neither the person's nor the pilot's commands, and no mode."""
+    rows: list[dict[str, Any] | str] = [
+        {key: value for key, value in record(k).items() if not key.startswith("user/")}
+        | {"steering": -0.1 * k, "throttle": 0.2}
+        for k in range(3)
+    ]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.commands.angle is not None
+    assert drive.commands.throttle is not None
+    np.testing.assert_allclose(drive.commands.angle, [0.0, -0.1, -0.2])
+    np.testing.assert_allclose(drive.commands.throttle, 0.2)
+    assert not drive.problems
+
+
 def test_useless_timestamps_are_replaced_and_said_so(tmp_path: Path) -> None:
     rows: list[dict[str, Any] | str] = [record(k, _timestamp_ms=3 * k) for k in range(2, 8)]
     drive = open_drive(write_tub(tmp_path / "tub", rows))

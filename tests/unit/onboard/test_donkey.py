@@ -254,6 +254,57 @@ def test_cv_controller(example_rgb):
     controller.shutdown()
 
 
+class MovedLines(Answers):
+    """Keeps how far it was told that the car has moved."""
+
+    def moved(self, travel_cm, turn_rad, wheelbase_cm):
+        self.travel_cm, self.turn_rad = travel_cm, turn_rad
+
+
+@pytest.fixture
+def controller(pilot):
+    limits = pilot._settings.limits.model_copy(update={"throttle_rate_s": 1.0})
+    controller = CvLaneController(None, SimpleNamespace(LANENET_CONFIG=str(CONFIG)))
+    controller.pilot = pilot_of(pilot._settings.model_copy(update={"limits": limits}))
+    controller.pilot._detector = MovedLines()
+    controller.pilot._detector.estimate = lane(0.0)
+    return controller
+
+
+@pytest.mark.parametrize(("throttle", "speed_cm_s"), [(0.0, 0.0), (0.2, 40.0), (-0.5, 0.0)])
+@pytest.mark.parametrize("mode", ["user", "local_angle"])
+def test_a_person_with_the_throttle_moves_the_lane_memory(controller, mode, throttle, speed_cm_s):
+    """By the throttle in force, (0.2 - 0.1) x 400 cm/s, not by the one that the pilot would have given."""
+    for _ in range(3):
+        controller.run(IMAGE, mode, -0.5, throttle)
+    detector = controller.pilot._detector
+    assert detector.travel_cm == pytest.approx(0.05 * speed_cm_s)
+    # Half of 0.4 rad to the left.
+    assert detector.turn_rad == pytest.approx(detector.travel_cm * math.tan(0.2) / 20.0)
+
+
+def test_full_auto_begins_with_the_throttle_that_was_in_force(controller):
+    """From Auto Steer, at rest and rolling; the pilot has its own wish ready all the time."""
+    for before in (0.0, 0.12):
+        for _ in range(8):
+            controller.run(IMAGE, "local_angle", 0.0, before)
+        throttles = [controller.run(IMAGE, "local", 0.0, before)[1] for _ in range(2)]
+        assert throttles == pytest.approx([before + 0.05, before + 0.1])
+    assert [controller.run(IMAGE, "local", 0.0, 0.2)[1] for _ in range(3)][-1] == 0.25
+
+
+def test_full_auto_after_a_person_drove_begins_anew(controller):
+    pilot = controller.pilot
+    pilot._check = Doubting(Concern.STOP)
+    for _ in range(8):
+        controller.run(IMAGE, "user", 0.3, 0.25)
+    assert pilot._finding.concern is Concern.STOP
+    resets = pilot._detector.resets
+    throttles = [controller.run(IMAGE, "local", 0.3, 0.25)[1] for _ in range(2)]
+    # Clock() goes on by 0.05 s each time it is asked, which is done once more when the pilot takes over.
+    assert throttles == pytest.approx([0.05, 0.1]) and pilot._detector.resets == resets + 1
+
+
 def test_what_is_missing_is_named(tmp_path):
     with pytest.raises(ConfigError, match="LANENET_CONFIG is missing"):
         CvLaneController(None, SimpleNamespace())
