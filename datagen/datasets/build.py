@@ -186,7 +186,7 @@ def shared_camera(settings: DataSettings, jobs: Sequence[Job]) -> Path | None:
     else:
         owner = None if recorded else _first_drive(jobs, "train")
     if len(recorded) == 1 and not any(isinstance(job, SyntheticJob) for job in jobs):
-        owner = None if recorded[0].is_labels else recorded[0].frames
+        return recorded[0].camera_file()
     return None if owner is None else owner / "camera.yaml"
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.datasets.settings import ROLES, DataSettings, RecordedSettings, Role
-from datagen.datasets.splits import in_window, split_recording
+from datagen.datasets.splits import split_recording
 from datagen.labels.truth import truth_labels
 from datagen.made import Output, fingerprint, key_of
 from datagen.pipeline import MapRequest, MapSettings, label_map, map_drive, map_key
@@ -22,10 +22,12 @@ from datagen.slam.segment import StageProgress
 from datagen.world.simulate import simulate_drive
 from datagen.world.variety import first_world, vary_simulation
 from datagen.world.world import SimulationSettings
+from lanenet.data.camera_file import write_camera
 from lanenet.data.files import write_text
-from lanenet.data.label_set import read_labels, write_labels
+from lanenet.data.label_set import read_label_index, read_labels, write_labels
 from lanenet.data.maps.folder import read_map
 from lanenet.errors import CalibrationError, ConfigError, TrackingLostError
+from lanenet.geometry.birdseye import BirdseyeWindow
 
 #: Synthetic drives of each role whose map and labels get pictures. Chosen: nobody looks at those of hundreds.
 _PICTURED = 2
@@ -214,7 +216,27 @@ class RecordedJob:
     @property
     def whole(self) -> Path:
         """The labels of the whole drive."""
-        return self.recording.path if self.is_labels else self.folder / "labels" / f"{self.name}.parquet"
+        given = self.is_labels and self._given_window == self.data.window
+        return self.recording.path if given else self.folder / "labels" / f"{self.name}.parquet"
+
+    @property
+    def _given_window(self) -> BirdseyeWindow:
+        return read_label_index(self.recording.path).meta.window
+
+    def camera_file(self) -> Path | None:
+        """Return the file of the drive's camera; None for a label set that does not hold it.
+
+        Raises:
+            LabelFormatError: If the label set cannot be read.
+        """
+        if not self.is_labels:
+            return self.frames / "camera.yaml"
+        camera = read_label_index(self.recording.path).meta.camera
+        if camera is None:
+            return None
+        path = self.folder / "labels" / f"{self.name}.camera.yaml"
+        write_camera(path, camera, f"that of the label set {self.recording.path}")
+        return path
 
     @property
     def map_output(self) -> Output:
@@ -322,9 +344,11 @@ class RecordedJob:
             if not self.is_labels:
                 window, weight = data.window, data.colour_weight
                 label_map(self.frames, self.whole, window=window, colour_weight=weight)
+            elif self.whole != settings.path:
+                write_labels(self.whole, read_labels(settings.path).in_window(data.window))
             if is_whole:
                 return
-            labels = in_window(read_labels(self.whole), data.window)
+            labels = read_labels(self.whole)
             for part, split in zip(parts, split_recording(labels, settings), strict=True):
                 write_labels(part.labels, split)
 

@@ -6,7 +6,6 @@ neighbouring frames show the same road from almost the same place.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,8 +15,6 @@ from datagen.datasets.settings import RecordedSettings
 from lanenet.data.label_set import LabelSet
 from lanenet.data.segments import equal_runs, map_segments
 from lanenet.errors import ConfigError
-from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import rows_of_polyline
 
 #: A lap with less than this share of the median lap's frames was not completed. Chosen: half a lap.
 _WHOLE_LAP = 0.5
@@ -94,15 +91,6 @@ def _lap_starts(labels: LabelSet) -> list[int]:
     laps = equal_runs(labels.lap)
     typical = np.median([len(lap) for lap in laps]) if laps else 0.0
     return [int(lap[0]) for lap in laps if len(lap) >= _WHOLE_LAP * typical]
-
-
-def in_window(labels: LabelSet, window: BirdseyeWindow) -> LabelSet:
-    """Return a label set for another bird's-eye window; its points and lines reach beyond the old one."""
-    if labels.meta.window == window:
-        return labels
-    found = np.array([np.concatenate([rows_of_polyline(line) for line in pair]) for pair in labels.lines])
-    points = window.labelled(np.where(np.isfinite(labels.points_cm), labels.points_cm, found))
-    return replace(labels, meta=replace(labels.meta, window=window), points_cm=points)
 
 
 def driven_cm(labels: LabelSet) -> Float[np.ndarray, "n"]:

@@ -32,6 +32,7 @@ from lanenet.data.maps.folder import DriveMap, read_edges, verdict_of
 from lanenet.data.maps.mapped_drive import open_mapped_drive
 from lanenet.data.tables import ParquetTable
 from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, MapFormatError, TrackingLostError
+from lanenet.geometry.birdseye import GENERAL_WINDOW
 from lanenet.processes import use_one_thread
 from lanenet.reading import read_image
 
@@ -186,6 +187,7 @@ def _label(job: Job, path: Path, map_folder: Path, folder: Path) -> dict[str, An
             map_folder,
             folder / LABELS_NAME,
             colour_weight=settings.colour_weight,
+            window=GENERAL_WINDOW,
             pictures=settings.pictures,
             drive=path,
             name=job.drive.name,

@@ -111,6 +111,7 @@ def label_map(
             perception=perception,
             marking_cm=drive_map.meta.tape_cm,
             camera_cm=drive_map.camera.mounting.at_cm,
+            camera=drive_map.camera,
         ),
         drive=[mapped.drive.name if name is None else name] * len(rows),
         file=[""] * len(rows),

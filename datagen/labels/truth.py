@@ -65,6 +65,7 @@ def truth_labels(
             perception=perception,
             marking_cm=marking_cm,
             camera_cm=drive.camera.mounting.at_cm,
+            camera=drive.camera,
         ),
         drive=[drive.name] * n,
         file=[""] * n,

@@ -40,7 +40,7 @@ def label(
         report = label_set(one, own, force, colour_weight)
         console.show_lines(report.lines)
     console.wrote(*outs)
-    console.next_command("val", "MODEL", maps[0])
+    console.next_command("train", maps[0], "--name", maps[0].resolve().name)
 
 
 def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | None) -> Report:
@@ -52,6 +52,7 @@ def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | N
         LanenetError: If another run writes ``out``.
     """
     from datagen.pipeline import label_map
+    from lanenet.geometry.birdseye import GENERAL_WINDOW
     from lanenet.perception.edges.road import COLOUR_WEIGHT
 
     check_ending(out, ".parquet")
@@ -59,4 +60,4 @@ def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | N
     lock_outputs(out)
     with console.progress_bar("label") as progress:
         weight = COLOUR_WEIGHT if colour_weight is None else colour_weight
-        return label_map(map_folder, out, progress, force=force, colour_weight=weight)
+        return label_map(map_folder, out, progress, force=force, colour_weight=weight, window=GENERAL_WINDOW)

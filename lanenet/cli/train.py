@@ -281,11 +281,21 @@ class _Run:
             TrackingLostError: If the map was rejected; names the cause, the remedy and the report.
         """
         from datagen.labels.label_map import refuse_rejected
+        from lanenet.data.label_set import read_label_index
         from lanenet.data.maps.folder import read_map, verdict_of
 
         if job.is_labels:
             job.make_map()
-            console.show_lines([f"{job.recording.path}: has labels already, which are used"])
+            path = job.recording.path
+            console.show_lines([f"{path}: has labels already, which are used"])
+            lacks = [f"{path}: holds no images, so that there will be no video of what the network sees"]
+            if read_label_index(path).meta.camera is None:
+                lacks.append(
+                    f"{path}: holds no camera (it was written by an earlier version): the checkpoint will "
+                    "have no camera.yaml, and the test will be of the network alone, frame by frame, which "
+                    "reads larger errors than on the car; lanenet label MAP makes a label set with its camera"
+                )
+            console.show_problems(lacks)
             return
         finished = job.is_mapped
         with console.progress_bar("map") as progress:
@@ -462,7 +472,8 @@ class _Run:
         for job in self.jobs:
             part = next((part for part in judged if part.frames == job.frames), None)
             if part is None or job.is_labels:
-                console.show_lines([f"{job.title}: no video, since it has no frames that were held out"])
+                why = "no frame of it was held out" if part is None else "a label set holds no images"
+                console.show_lines([f"{job.title}: no video, since {why}"])
                 continue
             numbers = read_labels(part.labels).frame
             camera = read_camera(job.frames / "camera.yaml")
@@ -549,7 +560,8 @@ def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[st
         labels = parts[role]
         first, last = int(labels.lap[0]) + 1, int(labels.lap[-1]) + 1
         laps = f"lap {first}" if first == last else f"laps {first} to {last}"
-        return f"{counted(len(labels), 'frame')}, {laps}"
+        numbers = f"{labels.frame[0]} to {labels.frame[-1]}"
+        return f"{counted(len(labels), 'frame')} ({numbers}), {laps}"
 
     if len(parts) == 1:
         (role,) = parts

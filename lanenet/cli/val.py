@@ -98,7 +98,6 @@ def val(
     from lanenet.evaluation.answers import Compared
     from lanenet.evaluation.model_page import model_page
     from lanenet.evaluation.report import report_files
-    from lanenet.geometry.birdseye import BirdseyeWindow
     from lanenet.perception.network.model_file import read_model_meta
 
     model, source_paths = _split_paths(paths)
@@ -109,13 +108,15 @@ def val(
     lock_outputs(out)
     views.check(source_paths[0] if len(source_paths) == 1 else None)
     meta = None if model is None else read_model_meta(model)
-    window, perception = (BirdseyeWindow(), None) if meta is None else (meta.window, meta.perception)
+    window, perception = (None, None) if meta is None else (meta.window, meta.perception)
     sources = [open_source(path, window, perception, truth_labels) for path in source_paths]
     alone = model is not None and detectors is None and not show_all
     names = _chosen(detectors, no_baselines or (alone and out is None), model, sources)
     if detectors is None and names != ("network",) and any(source.frames is None for source in sources):
         left_out = listed(compared_names(lambda kind: not kind.on_label_sets))
         console.show_problems([f"label sets hold no frames: {left_out} are left out"])
+    if "network" in names:
+        console.show_problems([says for source in sources if (says := source.without_camera)])
     if robust:
         _check_robust(model, sources)
     networks = more if model is None or "network" not in names else {"network": model, **more}

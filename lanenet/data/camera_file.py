@@ -153,6 +153,22 @@ def write_camera(
     Raises:
         CalibrationError: If :func:`read_camera` would refuse the camera.
     """
+    checked = camera_data(camera, method, residuals, date, str(path))
+    write_text(path, _dump(checked))
+
+
+def camera_data(
+    camera: Camera,
+    method: str = "",
+    residuals: dict[str, float] | None = None,
+    date: str | None = None,
+    where: str = "camera",
+) -> dict[str, Any]:
+    """Return a camera as the plain values of its file; the other arguments as for :func:`write_camera`.
+
+    Raises:
+        CalibrationError: If :func:`read_camera` would refuse the camera; names ``where``.
+    """
     m = camera.mounting
     data = {
         "format": "lanenet-camera/1",
@@ -167,8 +183,7 @@ def write_camera(
         "residuals": {name: float(value) for name, value in (residuals or {}).items()},
         "date": date,
     }
-    checked = _checked(CameraFile, data, str(path))
-    write_text(path, _dump(checked.model_dump(mode="json")))
+    return _checked(CameraFile, data, where).model_dump(mode="json")
 
 
 class _RosMatrix(Settings):

@@ -8,7 +8,7 @@ the edge points again. Metadata hold what all rows share.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import Field
 
 from lanenet.config import Settings, check_settings
+from lanenet.data.camera_file import CameraFile, camera_data
 from lanenet.data.files import require
 from lanenet.data.tables import (
     MAX_PLACE,
@@ -27,9 +28,10 @@ from lanenet.data.tables import (
     read_footer,
     write_parquet,
 )
-from lanenet.errors import ConfigError, LabelFormatError
+from lanenet.errors import CalibrationError, ConfigError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
-from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, label_rows, rows_of_polyline
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdges
 from lanenet.reading import image_size, parsing
@@ -47,7 +49,9 @@ __all__ = [
     "write_labels",
 ]
 
-FORMAT = "lanenet-labels/2"
+FORMAT = "lanenet-labels/3"
+#: Before label sets held their camera.
+_WITHOUT_CAMERA = "lanenet-labels/2"
 #: Rows of a row group, which training reads one by one where not all fit into memory. Chosen: 17 MB of the
 #: densest frames, and still few enough groups in a day of driving.
 GROUP_ROWS = 256
@@ -68,6 +72,7 @@ class LabelMeta:
         marking_cm: Width of the markings; None if unknown.
         config_hash: Hash of the settings that made the labels; empty if unknown.
         camera_cm: Optical centre right of, ahead of and above the front axle; None if unknown.
+        camera: Camera of the edge points; None in label sets of format 2.
     """
 
     window: BirdseyeWindow
@@ -79,6 +84,8 @@ class LabelMeta:
     marking_cm: float | None = None
     config_hash: str = ""
     camera_cm: tuple[float, float, float] | None = None
+    # Compared by its hash.
+    camera: Camera | None = field(default=None, compare=False)
 
 
 _EDGE_COLUMNS = (
@@ -144,6 +151,26 @@ class LabelSet:
         """Return the bird's-eye raster of row ``i``, with all planes."""
         window = self.meta.window
         return fill_raster(window, RoadEdges.of_rows(self.edges[i]), new_raster(window))
+
+    def in_window(self, window: BirdseyeWindow) -> LabelSet:
+        """Return the frames for another bird's-eye window: edge points and lines reach beyond the old one.
+
+        Points beside the old window get their labels from the lines; what was masked inside of it stays so.
+        Frames with both lines beside the old window may have been left out when the set was made.
+        """
+        old = self.meta.window
+        if window == old:
+            return self
+        # Of a map as strictly as when it was labelled.
+        rows = label_rows if self.meta.source == "map" else rows_of_polyline
+        found = [np.concatenate([rows(line) for line in pair]) for pair in self.lines]
+        found_cm = np.array(found, np.float64).reshape(-1, N_POINTS)
+        hidden = np.isfinite(old.labelled(found_cm))
+        # A frame without any label, with lines in the old window, is not to be labelled.
+        hidden |= (hidden.any(axis=1) & np.isnan(self.points_cm).all(axis=1))[:, None]
+        beside = np.isnan(self.points_cm) & ~hidden
+        points_cm = window.labelled(np.where(beside, found_cm, self.points_cm))
+        return replace(self, meta=replace(self.meta, window=window), points_cm=points_cm)
 
     def subset(self, keep: slice | Bool[np.ndarray, "n"] | Int[np.ndarray, "m"]) -> LabelSet:
         """Return the selected rows, in the given order."""
@@ -311,7 +338,7 @@ _UNITS = {"_cm": "centimetre", "_rad": "radian", "_s": "second", "quality": "0 t
 class _MetaFile(Settings):
     """The metadata in the file, see :class:`LabelMeta`."""
 
-    format: Literal["lanenet-labels/2"]
+    format: Literal["lanenet-labels/3", "lanenet-labels/2"]
     rows_cm: tuple[float, ...]
     order: tuple[str, ...]
     units: dict[str, str]
@@ -324,6 +351,7 @@ class _MetaFile(Settings):
     marking_cm: float | None = Field(gt=0.0)
     config_hash: str
     camera_cm: tuple[float, float, float] | None
+    camera: CameraFile | None = None
 
 
 def _meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:
@@ -333,16 +361,25 @@ def _meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:
         "rows_cm": list(ROWS_CM),
         "order": list(POINT_NAMES),
         "units": _UNITS,
-        **asdict(meta),
+        **vars(meta),
+        "window": vars(meta.window),
         "perception": meta.perception.model_dump(mode="json"),
+        "camera": None if meta.camera is None else _camera_to_file(meta.camera, where),
     }
     _meta_from_file(data, where)
     return data
 
 
+def _camera_to_file(camera: Camera, where: str) -> dict[str, Any]:
+    try:
+        return camera_data(camera)
+    except CalibrationError as error:
+        raise LabelFormatError(f"{where}: {error}") from None
+
+
 def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
     found = data.get("format")
-    if found != FORMAT:
+    if found not in (FORMAT, _WITHOUT_CAMERA):
         raise LabelFormatError(f"{where}: expected format {FORMAT!r}, found {found!r}")
     try:
         file = check_settings(_MetaFile, data, f"{where}: metadata")
@@ -354,7 +391,12 @@ def _meta_from_file(data: dict[str, Any], where: str) -> LabelMeta:
             f"{file.rows_cm} in the order {', '.join(file.order)}"
         )
     shared = {item.name: getattr(file, item.name) for item in fields(LabelMeta)}
-    return LabelMeta(**{**shared, "window": file.window.window()})
+    camera = None if file.camera is None else file.camera.camera()
+    if camera is not None and camera.hash != file.camera_hash:
+        raise LabelFormatError(
+            f"{where}: its camera has the hash {camera.hash}, but its edge points are of {file.camera_hash}"
+        )
+    return LabelMeta(**{**shared, "window": file.window.window(), "camera": camera})
 
 
 def _check_values(label_set: LabelSet, where: str) -> None:

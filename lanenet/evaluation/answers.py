@@ -15,10 +15,10 @@ from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.errors import ConfigError, ModelMismatchError
 from lanenet.evaluation.detect import run_detectors
 from lanenet.evaluation.plain_sight import in_plain_sight
-from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import N_POINTS, SIDES
-from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
-from lanenet.perception.estimate import Detector, DetectorInputs, EdgeDetector
+from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor, RoadEdges
+from lanenet.perception.estimate import Detector, DetectorInputs, EdgeDetector, LaneEstimate
+from lanenet.perception.network.detector import NetworkDetector
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, open_model
 from lanenet.perception.registry import build_detector, build_on_edges, compared_names, kind_of
 from lanenet.processes import run_jobs
@@ -189,15 +189,19 @@ class Compared:
         return run_jobs(self.answer, [(source.name, source) for source in sources], workers, report)
 
     def answer_labels(self, labels: LabelSet, source: Path) -> Answers:
-        """Run networks on a label set's rasters, and the other detectors on its edge points.
+        """Run detectors on a label set's edge points.
+
+        Of a label set without its camera networks answer each raster alone: the lane is not followed from
+        frame to frame, nor are its lines fitted to the edge points.
 
         Raises:
             ConfigError: If a detector needs frames.
             ModelMismatchError: If a model does not fit the label set, which lies at ``source``.
         """
-        meta, answers = labels.meta, Answers({})
+        meta, answers, n = labels.meta, Answers({}), len(labels)
         for name in self.in_order:
-            path = self.models.get(name)
+            kind = kind_of("network" if name in self.models else name)
+            path = self.models.get(name, self.models.get(kind.name))
             if path is None:
                 marking_cm = meta.marking_cm if self.marking_cm is None else self.marking_cm
                 inputs = DetectorInputs(lane_width_cm=meta.lane_width_cm, marking_cm=marking_cm)
@@ -206,9 +210,21 @@ class Compared:
             model = RasterModel(path)
             if not self.any_camera:
                 model.meta.check_trained_with(meta.camera_hash, f"the camera of {source}", str(path))
-            found = model.answer_labels(labels)
-            answers.points_cm[name], answers.sigma_cm[name] = found.points_cm, found.sigma_cm
-            answers.presence[name] = found.presence
+            if meta.camera is None:
+                found = model.answer_labels(labels)
+                answers.points_cm[name], answers.sigma_cm[name] = found.points_cm, found.sigma_cm
+                answers.presence[name] = found.presence
+                continue
+            model.check_edges(meta.perception)
+            inputs = DetectorInputs(
+                camera=meta.camera, model=path, any_camera=self.any_camera, lane_width_cm=meta.lane_width_cm
+            )
+            detector = build_detector(kind.name if name in self.models else name, inputs)
+            assert isinstance(detector, NetworkDetector)
+            estimates = answer_each_edges(labels, detector, detector.detect_edges)
+            answers.points_cm[name] = np.array([e.points_cm for e in estimates]).reshape(n, N_POINTS)
+            answers.sigma_cm[name] = np.array([e.sigma_cm for e in estimates]).reshape(n, N_POINTS)
+            answers.presence[name] = np.array([e.presence for e in estimates]).reshape(n, len(SIDES))
         return answers
 
 
@@ -220,9 +236,7 @@ def hidden_rows(frames: LabelledFrames) -> UInt8[np.ndarray, "h w"]:
 
 
 def answer_edges(label_set: LabelSet, detector: EdgeDetector) -> Float[np.ndarray, "n 6"]:
-    """Run a detector over the edge points of a label set.
-
-    The detector is reset wherever a frame does not follow the one before it.
+    """Run a detector of edge points over a label set.
 
     Args:
         label_set: Frames with their edge points and the directions of these.
@@ -231,7 +245,28 @@ def answer_edges(label_set: LabelSet, detector: EdgeDetector) -> Float[np.ndarra
     Returns:
         Six points per frame, [cm], frame car; NaN where the detector has no answer.
     """
-    points = np.full(label_set.points_cm.shape, np.nan)
+
+    def of(edges: RoadEdges) -> LaneEstimate:
+        points, normals = (np.asarray(values, np.float64) for values in (edges.points_cm, edges.normals))
+        return detector.estimate(points, normals)
+
+    estimates = answer_each_edges(label_set, detector, of)
+    return np.array([estimate.points_cm for estimate in estimates]).reshape(len(label_set), N_POINTS)
+
+
+def answer_each_edges(
+    label_set: LabelSet, detector: Detector | EdgeDetector, of: Callable[[RoadEdges], LaneEstimate]
+) -> list[LaneEstimate]:
+    """Return what a detector says of each frame's edge points.
+
+    The detector is reset wherever a frame does not follow the one before it.
+
+    Args:
+        label_set: Frames with their edge points.
+        detector: The detector.
+        of: Its answer to the edge points of one frame.
+    """
+    estimates = []
     for i, edges in enumerate(label_set.edges):
         follows = (
             i > 0
@@ -240,9 +275,8 @@ def answer_edges(label_set: LabelSet, detector: EdgeDetector) -> Float[np.ndarra
         )
         if not follows:
             detector.reset()
-        edges = np.asarray(edges, np.float64)
-        points[i] = detector.estimate(edges[:, :2], edges[:, 2:4]).points_cm
-    return points
+        estimates.append(of(RoadEdges.of_rows(edges)))
+    return estimates
 
 
 @dataclass(frozen=True)
@@ -279,17 +313,12 @@ class RasterModel:
         self.path = path
         self._session, self.meta = open_model(path, threads)
 
-    def check_rasters(self, window: BirdseyeWindow, perception: PerceptionSettings) -> None:
-        """Refuse rasters of another window, or of edges that were found with other settings.
+    def check_edges(self, perception: PerceptionSettings) -> None:
+        """Refuse edges that were found with other settings.
 
         Raises:
             ModelMismatchError: Naming both.
         """
-        if window != self.meta.window:
-            raise ModelMismatchError(
-                f"{self.path}: made for the window {self.meta.window}, but the label set has {window}; "
-                "give the map or the drive itself, which has edges for any window"
-            )
         unlike = perception.unlike(self.meta.perception)
         if unlike:
             raise ModelMismatchError(
@@ -323,12 +352,13 @@ class RasterModel:
         return RasterAnswers(**values)
 
     def answer_labels(self, labels: LabelSet) -> RasterAnswers:
-        """Run the model on the frames of a label set, whose lane width is known.
+        """Run the model on the frames of a label set, in its own window; their lane width is known.
 
         Raises:
-            ModelMismatchError: If it has another window or other edges.
+            ModelMismatchError: If it is for edges that were found with other settings.
         """
-        self.check_rasters(labels.meta.window, labels.meta.perception)
+        self.check_edges(labels.meta.perception)
+        labels = labels.in_window(self.meta.window)
         rasters = [labels.raster(i)[: self.meta.planes] for i in range(len(labels.points_cm))]
         shape = (-1, self.meta.planes, self.meta.window.rows, self.meta.window.columns)
         lane_cm = np.full(len(rasters), labels.meta.lane_width_cm)

@@ -106,24 +106,32 @@ def measure_robustness(
         a model that takes it, unknown.
 
     Raises:
-        LabelFormatError: If a label set has no lane lines, or two have different windows.
-        ModelMismatchError: If a model has another window or other edges.
+        LabelFormatError: If a label set has no lane lines.
+        ModelMismatchError: If a model is for edges that were found with other settings.
     """
     for labels, name in zip(label_sets, names, strict=True):
         if not can_measure(labels):
             raise LabelFormatError(f"{name}: has no lane lines, expected a label set made of a map or a road")
-    samples = LaneSamples(label_sets, names)
+    # A raster and labels for the window of each model.
+    samples = {
+        window: LaneSamples([labels.in_window(window) for labels in label_sets], names)
+        for window in dict.fromkeys(model.meta.window for model in models.values())
+    }
     for model in models.values():
-        model.check_rasters(samples.window, samples.perception)
-    indices, ends = np.arange(len(samples)), samples.set_start[1:-1]
+        model.check_edges(samples[model.meta.window].perception)
     rows = []
     for done, change in enumerate(CHANGES, start=1):
-        batch = samples.augmented_batch(indices, change_settings(change), _SEED, 0)
-        truth_cm, visible = batch.points_cm.astype(np.float64), batch.present
+        settings = change_settings(change)
+        batches = {
+            window: each.augmented_batch(np.arange(len(each)), settings, _SEED, 0)
+            for window, each in samples.items()
+        }
         for name, model in models.items():
             width_known = _WIDTH_KNOWN.get(change, model.meta.takes_width)
             if change in _WIDTH_KNOWN and width_known == model.meta.takes_width:
                 continue  # the same as "one line missing"
+            batch, ends = batches[model.meta.window], samples[model.meta.window].set_start[1:-1]
+            truth_cm, visible = batch.points_cm.astype(np.float64), batch.present
             answers = model.answer(batch.rasters, batch.lane_cm if width_known else None)
             if change in _MISSING_SIDE and width_known:
                 answers = _with_width(answers, batch.lane_cm)

@@ -46,6 +46,16 @@ class Opened:
         return Path(read_yaml(file)["drive"]) if file.is_file() else self.path
 
     @property
+    def without_camera(self) -> str:
+        """What a label set lacks for networks if it does not hold its camera; empty if nothing."""
+        if self.frames is not None or self.labels is None or self.labels.meta.camera is not None:
+            return ""
+        return (
+            f"{self.path}: holds no camera, so that a network answers each frame alone, less exactly than on "
+            "the car; lanenet label MAP makes a label set with its camera"
+        )
+
+    @property
     def lane_width_cm(self) -> float:
         """Between the middles of the lane's two lines."""
         if self.frames is not None:
@@ -56,7 +66,7 @@ class Opened:
 
 def open_source(
     path: Path,
-    window: BirdseyeWindow,
+    window: BirdseyeWindow | None,
     perception: PerceptionSettings | None,
     read_truth_labels: TruthReader,
 ) -> Opened:
@@ -64,7 +74,8 @@ def open_source(
 
     Args:
         path: Where it lies.
-        window: Points of drives and maps outside this bird's-eye window have no label.
+        window: Points outside this bird's-eye window have no label; None takes that of the label set, or the
+            default.
         perception: How the edges of a simulated drive's label set are found; None takes the defaults.
         read_truth_labels: Reads the label set of a simulated drive from its truth
             (:func:`datagen.labels.truth.truth_labels`).
@@ -78,7 +89,8 @@ def open_source(
     if not path.exists():
         raise DriveFormatError(f"{path}: no such model or source{meant_instead(path)}")
     if path.is_file():
-        return Opened(path, labels=read_labels(path))
+        labels = read_labels(path)
+        return Opened(path, labels=labels if window is None else labels.in_window(window))
     _check_folder(path)
     frames = _open_frames(path, window)
     if frames.reference == "map":
@@ -98,7 +110,7 @@ def _check_folder(path: Path) -> None:
         )
 
 
-def _open_frames(path: Path, window: BirdseyeWindow) -> LabelledFrames:
+def _open_frames(path: Path, window: BirdseyeWindow | None) -> LabelledFrames:
     """Open a map folder or a simulated drive."""
     from lanenet.data.maps.mapped_drive import read_map_frames, read_truth_frames
 

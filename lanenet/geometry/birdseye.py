@@ -92,6 +92,10 @@ class BirdseyeWindow:
         return y[inside].astype(np.intp), x[inside].astype(np.intp), inside
 
 
+#: Window of the networks for any camera, as ``checkpoints/general``: it shows lanes of up to 128 cm.
+GENERAL_WINDOW = BirdseyeWindow(left_cm=-64.0, cell_cm=1.0)
+
+
 class WindowFile(Settings):
     """A window in a file; see :class:`BirdseyeWindow`.
 

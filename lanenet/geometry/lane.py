@@ -26,6 +26,8 @@ N_POINTS = len(POINT_NAMES)
 #: Least distance of the front axle's middle from a line between two lanes, in lane widths; closer, the image
 #: does not show which lane is the car's. Chosen: 2 cm of a lane of 40 cm.
 BESIDE_DIVIDER_LANES = 0.05
+#: Tangent of 60 degrees. Chosen: where a line is steeper, 1 cm along the car is 1.7 cm across a label row.
+STEEPEST = math.tan(math.pi / 3.0)
 
 #: Widths of lanes. Chosen: a tenth of the width of 1:10 cars, and a road of many lanes.
 _LANE_CM = (2.0, 1000.0)
@@ -103,6 +105,26 @@ def rows_of_polyline(line_car_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
             t = (row - y[k]) / (y[k + 1] - y[k])
             result[i] = x[k] + t * (x[k + 1] - x[k])
     return result
+
+
+def label_rows(line_car_cm: Float[np.ndarray, "m 2"], steepest: float = STEEPEST) -> Float[np.ndarray, "3"]:
+    """Find x where a line of a map crosses the label rows; NaN where too obliquely or more than once.
+
+    Stricter than :func:`rows_of_polyline`, which ground truth uses: a map may be wrong.
+
+    Args:
+        line_car_cm: Polyline in the direction of travel, frame car; NaN rows break it.
+        steepest: Most centimetres across for one along the car.
+    """
+    found = rows_of_polyline(line_car_cm)
+    x, y = line_car_cm[:, 0], line_car_cm[:, 1]
+    for i, row in enumerate(ROWS_CM):
+        crossed = np.flatnonzero((y[:-1] <= row) != (y[1:] <= row))
+        crossed = crossed[np.isfinite(y[crossed]) & np.isfinite(y[crossed + 1])]
+        sideways, ahead = (abs(part[crossed + 1] - part[crossed]) for part in (x, y))
+        if len(crossed) != 1 or sideways[0] > steepest * ahead[0]:
+            found[i] = np.nan
+    return found
 
 
 def mirror_points(points_cm: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 6"]:

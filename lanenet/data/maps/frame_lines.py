@@ -10,14 +10,12 @@ from jaxtyping import Bool, Float, Int
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.segments import equal_runs, true_runs
 from lanenet.geometry.frames import car_from_map
-from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, N_POINTS, ROWS_CM, rows_of_polyline
+from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, N_POINTS, STEEPEST, label_rows
 
 #: Spacing of a polyline's points. Chosen: chords of a 50 cm bend deviate by 0.1 mm.
 _SAMPLE_CM = 2.0
 #: Extent of the polylines: from behind the rear axle to beyond the far edge of the bird's-eye window (72 cm).
 _BEHIND_CM, _AHEAD_CM = 20.0, 90.0
-#: Tangent of 60 degrees. Chosen: where a line is steeper, 1 cm along the car is 1.7 cm across a label row.
-STEEPEST = float(np.tan(np.pi / 3.0))
 #: How far the car enters another lane at least, in lane widths; less is a swerve. Chosen: half of the 0.4 by
 #: which a car may be off the centre of its own lane (datagen/lanes/markings.py).
 _ENTERED = 0.2
@@ -81,7 +79,7 @@ def lines_of_frame(
         lane: Index of the line on the left of the lane, seen in the path's direction; 0 is the driven lane.
         forward: Whether the car drives in the path's direction; if not, left and right swap.
         max_sigma_cm: A line is masked where its sigma exceeds this, and where the images contradict it.
-        steepest: See :func:`label_rows`.
+        steepest: See :func:`lanenet.geometry.lane.label_rows`.
     """
     by_index = {line.index: line for line in lines}
     pair = (lane, lane + 1) if forward else (lane + 1, lane)
@@ -96,26 +94,6 @@ def lines_of_frame(
     assert points.shape == (N_POINTS,)
     of_left, of_right = (np.full(len(s), np.nan) if line is None else line.widths_cm(s) for line in bounds)
     return FrameLines(left, right, points, (of_left, of_right))
-
-
-def label_rows(line_car_cm: Float[np.ndarray, "m 2"], steepest: float = STEEPEST) -> Float[np.ndarray, "3"]:
-    """Find x where a line of a map crosses the label rows; NaN where too obliquely or more than once.
-
-    Stricter than :func:`lanenet.geometry.lane.rows_of_polyline`, which ground truth uses: a map may be wrong.
-
-    Args:
-        line_car_cm: Polyline in the direction of travel, frame car; NaN rows break it.
-        steepest: Most centimetres across for one along the car.
-    """
-    found = rows_of_polyline(line_car_cm)
-    x, y = line_car_cm[:, 0], line_car_cm[:, 1]
-    for i, row in enumerate(ROWS_CM):
-        crossed = np.flatnonzero((y[:-1] <= row) != (y[1:] <= row))
-        crossed = crossed[np.isfinite(y[crossed]) & np.isfinite(y[crossed + 1])]
-        sideways, ahead = (abs(part[crossed + 1] - part[crossed]) for part in (x, y))
-        if len(crossed) != 1 or sideways[0] > steepest * ahead[0]:
-            found[i] = np.nan
-    return found
 
 
 def parallel_line(line_car_cm: Float[np.ndarray, "m 2"], right_cm: float) -> Float[np.ndarray, "m 2"]:

@@ -18,11 +18,11 @@ from lanenet.data.drives import Drive, open_drive
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.label_set import Source
 from lanenet.data.maps.folder import SETTINGS_NAME, DriveMap, read_map
-from lanenet.data.maps.frame_lines import STEEPEST, FrameLines, label_rows, lines_of_frame, parallel_line
+from lanenet.data.maps.frame_lines import FrameLines, lines_of_frame, parallel_line
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, SIDES
+from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, SIDES, STEEPEST, label_rows
 from lanenet.perception.edges.road import PerceptionSettings
 
 #: Matched share of a frame's edge points below which its pose is uncertain. The lowest match in the

@@ -22,7 +22,7 @@ from lanenet.geometry.lane import (
     rows_of_polyline,
 )
 from lanenet.perception.edges.raster import fill_raster, new_raster
-from lanenet.perception.edges.road import RoadEdgeExtractor
+from lanenet.perception.edges.road import RoadEdgeExtractor, RoadEdges
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
 from lanenet.perception.network.compact.network import ANSWERS, open_network
 from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta
@@ -123,10 +123,13 @@ class NetworkDetector:
         Raises:
             CalibrationError: If the frame's size is not the camera's.
         """
+        return self.detect_edges(self._extractor.extract(frame_bgr))
+
+    def detect_edges(self, edges: RoadEdges) -> LaneEstimate:
+        """Find the lane in the edge points of one frame, as label sets hold them; as :meth:`detect`."""
         if not self._keeps:
             self.memory.reset()
             self._tracker.reset()
-        edges = self._extractor.extract(frame_bgr)
         if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE) or not np.count_nonzero(
             fill_raster(self.meta.window, edges, self._raster)[0]
         ):

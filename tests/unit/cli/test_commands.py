@@ -377,8 +377,8 @@ def fake_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]
             opened.append(path)
             self.meta = meta
 
-        def check_rasters(self, window: BirdseyeWindow, perception: PerceptionSettings) -> None:
-            assert window == BirdseyeWindow()
+        def check_edges(self, perception: PerceptionSettings) -> None:
+            assert perception == PerceptionSettings()
 
         def answer(self, rasters: np.ndarray, lane_cm: np.ndarray | None = None) -> RasterAnswers:
             n = len(rasters)

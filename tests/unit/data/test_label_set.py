@@ -11,11 +11,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
+from lanenet.data.camera_file import camera_data, read_camera
+from lanenet.data.label_set import (
+    LabelMeta,
+    LabelSet,
+    read_label_index,
+    read_labels,
+    read_places,
+    write_labels,
+)
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import POINT_NAMES
 
+CAMERA = read_camera(Path(__file__).resolve().parents[3] / "checkpoints" / "small" / "camera.yaml")
 META = LabelMeta(
     window=BirdseyeWindow(left_cm=-24.0, cell_cm=1.5, rows=32, columns=32),
     camera_hash="0123456789abcdef",
@@ -71,6 +80,59 @@ def assert_same(a: LabelSet, b: LabelSet) -> None:
             np.testing.assert_array_equal(line_a, line_b)
 
 
+def test_the_camera_travels_with_the_set(tmp_path: Path) -> None:
+    path, meta = tmp_path / "labels.parquet", replace(META, camera=CAMERA, camera_hash=CAMERA.hash)
+    write_labels(path, replace(make_labels(), meta=meta))
+    for found in (read_labels(path).meta, read_label_index(path).meta, read_places(path).meta):
+        assert found == meta and found.camera is not None and found.camera.hash == CAMERA.hash
+        assert found.camera.mounting == CAMERA.mounting
+
+
+def test_a_set_of_the_format_before_has_no_camera(tmp_path: Path) -> None:
+    path = rewritten(tmp_path, {"format": "lanenet-labels/2"}, without=("camera",))
+    assert_same(read_labels(path), make_labels())
+    assert read_labels(path).meta.camera is None
+
+
+NARROW, WIDE = BirdseyeWindow(left_cm=-30.0, columns=80), BirdseyeWindow(left_cm=-60.0, columns=160)
+
+
+def lane_at(source: str, *x_cm: float, masked: tuple[int, ...] = ()) -> LabelSet:
+    """Frames with straight lines, 40 cm apart, the left one at ``x_cm``; ``masked`` ones have no labels."""
+    y = np.array([-20.0, 90.0])
+    lines = [(np.stack([0 * y + x, y], axis=1), np.stack([0 * y + x + 40.0, y], axis=1)) for x in x_cm]
+    n = len(x_cm)
+    points = NARROW.labelled(np.array([np.repeat([x, x + 40.0], 3) for x in x_cm]))
+    points[list(masked)] = np.nan
+    meta = replace(META, window=NARROW, source=source)
+    return replace(make_labels(n), meta=meta, lines=lines, points_cm=points)
+
+
+@pytest.mark.parametrize("source", ["map", "truth"])
+def test_another_window_shows_what_lies_beside_the_first(source: str) -> None:
+    labels = lane_at(source, -20.0, -45.0, 15.0)
+    assert np.isfinite(labels.points_cm).all(axis=1).tolist() == [True, False, False]
+    wide = labels.in_window(WIDE)
+    expected = [np.repeat([x, x + 40.0], 3) for x in (-20.0, -45.0, 15.0)]
+    np.testing.assert_allclose(wide.points_cm, expected)
+    assert wide.meta.window == WIDE and wide.raster(1).shape[1:] == (WIDE.rows, WIDE.columns)
+    np.testing.assert_array_equal(wide.in_window(NARROW).points_cm, labels.points_cm)
+    assert labels.in_window(NARROW) is labels
+
+
+def test_another_window_shows_no_label_that_was_masked_for_another_reason() -> None:
+    labels = lane_at("map", -20.0, -20.0, -45.0, masked=(1, 2))
+    labels.points_cm[0, 4] = np.nan
+    wide = labels.in_window(WIDE).points_cm
+    # One point of a line, and frames that were not to be labelled.
+    np.testing.assert_array_equal(wide, labels.points_cm)
+    # A map's line that crosses a row too obliquely has no place in it, a simulator's has.
+    oblique = np.array([[-58.0, -20.0], [200.0, 90.0]])
+    for source, known in (("map", False), ("truth", True)):
+        one = replace(lane_at(source, -45.0), lines=[(oblique, lane_at(source, -45.0).lines[0][1])])
+        assert np.isfinite(one.in_window(WIDE).points_cm[0, :3]).any() == known
+
+
 @pytest.mark.parametrize("n", [0, 1, 6])
 def test_round_trip(tmp_path: Path, n: int) -> None:
     labels = make_labels(n)
@@ -108,7 +170,7 @@ def test_other_tools_see_nulls_units_and_an_image(tmp_path: Path) -> None:
     hugging_face = json.loads(table.schema.metadata[b"huggingface"])
     assert hugging_face["info"]["features"]["image"] == {"_type": "Image"}
     meta = json.loads(table.schema.metadata[b"lanenet"])
-    assert meta["format"] == "lanenet-labels/2"
+    assert meta["format"] == "lanenet-labels/3"
     assert meta["rows_cm"] == [0.0, 15.0, 30.0]
     assert meta["order"] == list(POINT_NAMES)
     assert meta["window"] == {"left_cm": -24.0, "near_cm": 0.0, "cell_cm": 1.5, "rows": 32, "columns": 32}
@@ -175,14 +237,18 @@ def test_writing_refuses_edges_and_lines_that_are_not_finite(tmp_path: Path) -> 
         write_labels(tmp_path / "labels.parquet", labels)
 
 
-def rewritten(tmp_path: Path, meta: dict[str, Any] | None = None, **columns: Any) -> Path:
+def rewritten(
+    tmp_path: Path, meta: dict[str, Any] | None = None, without: tuple[str, ...] = (), **columns: Any
+) -> Path:
     """A label set with metadata or columns replaced; a column that is None is dropped."""
     path = tmp_path / "labels.parquet"
     write_labels(path, make_labels())
     table = pq.read_table(path)
     metadata = dict(table.schema.metadata)
     if meta is not None:
-        metadata[b"lanenet"] = json.dumps(json.loads(metadata[b"lanenet"]) | meta).encode()
+        data = json.loads(metadata[b"lanenet"]) | meta
+        kept = {key: value for key, value in data.items() if key not in without}
+        metadata[b"lanenet"] = json.dumps(kept).encode()
     for name, values in columns.items():
         place = table.column_names.index(name)
         table = table.remove_column(place) if values is None else table.set_column(place, name, [values])
@@ -193,8 +259,13 @@ def rewritten(tmp_path: Path, meta: dict[str, Any] | None = None, **columns: Any
 @pytest.mark.parametrize(
     ("meta", "message"),
     [
-        ({"format": "lanenet-labels/3"}, "expected format 'lanenet-labels/2', found 'lanenet-labels/3'"),
-        ({"format": None}, "expected format 'lanenet-labels/2', found None"),
+        ({"format": "lanenet-labels/4"}, "expected format 'lanenet-labels/3', found 'lanenet-labels/4'"),
+        ({"format": None}, "expected format 'lanenet-labels/3', found None"),
+        ({"camera": {"format": "lanenet-camera/1"}}, "key 'camera.model' is missing"),
+        (
+            {"camera": camera_data(CAMERA)},
+            f"its camera has the hash {CAMERA.hash}, but its edge points are of",
+        ),
         ({"rows_cm": [0, 10, 20]}, "expected labels at rows"),
         ({"order": list(POINT_NAMES[::-1])}, "in the order"),
         ({"source": "hand"}, "key 'source'"),

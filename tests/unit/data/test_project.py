@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lanenet.data.maps.frame_lines import label_rows, lines_of_frame
+from lanenet.data.maps.frame_lines import lines_of_frame
 from lanenet.data.maps.line import LaneLine, Side
-from lanenet.geometry.lane import ROWS_CM, mirror_points
+from lanenet.geometry.lane import ROWS_CM, label_rows, mirror_points
 
 WHEELBASE_CM = 17.0
 LENGTH_CM = 400.0

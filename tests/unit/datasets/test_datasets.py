@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,10 +22,11 @@ from datagen.datasets.splits import split_along_time
 from datagen.prepare import MapRequest
 from datagen.world.world import SimulationSettings
 from lanenet.config import check_settings
+from lanenet.data.camera_file import read_camera
 from lanenet.data.label_set import LabelMeta, LabelSet, read_labels, write_labels
 from lanenet.data.maps.folder import read_map, write_map
 from lanenet.errors import ConfigError, TrackingLostError
-from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.birdseye import GENERAL_WINDOW, BirdseyeWindow
 
 
 def _labels(frames: np.ndarray) -> LabelSet:
@@ -378,3 +380,26 @@ def test_a_map_stays_known_while_one_of_another_width_is_made(tmp_path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         wide.make_map()
     assert narrow.is_mapped and not wide.is_mapped
+
+
+@pytest.mark.parametrize("split", ["time", "train"])
+def test_a_label_set_of_another_window_is_learned_in_that_of_the_run(tmp_path, split):
+    path = tmp_path / "set.parquet"
+    write_labels(path, _labels(np.arange(400)))
+    before = path.read_bytes()
+    data = DataSettings(window=GENERAL_WINDOW)
+    job = RecordedJob(RecordedSettings(path=path, lane_width_cm=40.0, split=split), data, tmp_path / "work")
+    parts = job.run()
+    assert {read_labels(part.labels).meta.window for part in parts} == {GENERAL_WINDOW}
+    assert read_labels(job.whole).meta.window == GENERAL_WINDOW and path.read_bytes() == before
+
+
+def test_the_camera_of_a_label_set_is_that_of_the_run(tmp_path):
+    labels, path = _labels(np.arange(400)), tmp_path / "set.parquet"
+    camera = read_camera(Path(__file__).resolve().parents[3] / "checkpoints" / "small" / "camera.yaml")
+    data = DataSettings(drives=(RecordedSettings(path=path, lane_width_cm=40.0),))
+    write_labels(path, labels)
+    assert prepare(data, tmp_path / "work").camera is None
+    write_labels(path, replace(labels, meta=replace(labels.meta, camera=camera, camera_hash=camera.hash)))
+    found = prepare(data, tmp_path / "work").camera
+    assert found is not None and read_camera(found).hash == camera.hash

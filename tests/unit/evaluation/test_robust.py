@@ -24,13 +24,13 @@ class ColumnModel(RasterModel):
     """
 
     def __init__(self, window=FINE, takes_width=False, own_width_cm=36.0, guess_sigma_cm=20.0):
-        self.window, self.meta = window, SimpleNamespace(takes_width=takes_width)
+        self.window, self.meta = window, SimpleNamespace(takes_width=takes_width, window=window)
         self.own_width_cm, self.guess_sigma_cm = own_width_cm, guess_sigma_cm
         self.told = []
 
-    def check_rasters(self, window, perception):
-        if window != self.window:
-            raise ModelMismatchError("another window")
+    def check_edges(self, perception):
+        if perception != LABELS.meta.perception:
+            raise ModelMismatchError("other edges")
 
     def answer(self, rasters, lane_cm=None):
         n = len(rasters)
@@ -145,5 +145,14 @@ def test_what_cannot_be_changed_is_refused():
     nothing = (np.empty((0, 2)), np.empty((0, 2)))
     with pytest.raises(LabelFormatError, match="set 0: has no lane lines"):
         rows(sets=[replace(LABELS, lines=[nothing] * len(LABELS))])
+    in_colour = replace(LABELS, meta=replace(LABELS.meta, perception=LABELS.meta.perception.with_colours()))
     with pytest.raises(ModelMismatchError):
-        rows({"a": ColumnModel(BirdseyeWindow(cell_cm=1.0))})
+        rows(sets=[in_colour])
+
+
+def test_each_model_sees_the_window_that_it_is_for():
+    models = {"fine": ColumnModel(), "coarse": ColumnModel(BirdseyeWindow(cell_cm=1.0))}
+    found = {row.model: row.errors for row in rows(models) if row.change == "none"}
+    assert found["coarse"].truth_count == found["fine"].truth_count
+    # The coarse window reaches further, where these lanes bend away.
+    assert found["coarse"].rmse_cm != found["fine"].rmse_cm
