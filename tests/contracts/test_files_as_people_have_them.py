@@ -6,6 +6,7 @@ The kinds are those of public reports; docs/formats.md has the table of what is 
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from commands import refused
 from drives import frame_image, record, write_drive, write_tub
+from mp4 import Change, change_boxes, timed, turned
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
@@ -303,6 +305,104 @@ def test_an_unreadable_image_names_the_option_that_goes_on(tmp_path: Path) -> No
     assert "000002.jpg: the image file is empty" in line and "--skip-unreadable" in line
     assert CliRunner().invoke(app, [*words, "--skip-unreadable"]).exit_code == 0
     assert len(out.read_text().splitlines()) == 4
+
+
+# Videos: a container may lack times, or have any.
+
+
+def video(
+    changes: dict[bytes, Change] | None = None, name: str = "clip.mp4", codec: str = "mp4v", frames: int = 12
+) -> Make:
+    """A video of 20 frames/s, changed in its boxes."""
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 20.0, (64, 48))
+        assert writer.isOpened()
+        for k in range(frames):
+            writer.write(frame_image(k))
+        writer.release()
+        if changes:
+            change_boxes(path, changes)
+        return path
+
+    return make
+
+
+def raw_mjpeg(folder: Path) -> Path:
+    path = folder / "clip.mjpeg"
+    path.write_bytes(b"".join(cv2.imencode(".jpg", frame_image(k))[1].tobytes() for k in range(12)))
+    return path
+
+
+def holding(name: str, start: bytes, folder: str = "") -> Make:
+    """A file that begins with these bytes; the folder of it is opened if it has a name."""
+
+    def make(parent: Path) -> Path:
+        (parent / folder).mkdir(exist_ok=True)
+        (parent / folder / name).write_bytes(start + bytes(2000))
+        return parent / folder if folder else parent / name
+
+    return make
+
+
+TWELVE = list(range(12))
+SPS = b"\0\0\0\1\x67\x42\xc0\x1e"
+VIDEOS = [
+    Case("a constant rate", video(), TWELVE),
+    Case("a constant rate in another container", video(name="clip.mkv"), TWELVE),
+    Case("a rate that varies", video(timed((6, 1), (6, 3))), TWELVE, ("rate varies, steps of 50 to 150 ms",)),
+    Case("nothing but JPEGs", raw_mjpeg, TWELVE, ("no times", "20 frames/s", "clip.csv")),
+    Case("a phone held upright", video(turned(90)), TWELVE),
+    Case(
+        "H.264 of rpicam-vid", holding("clip.h264", SPS), [], ("raw", "ffmpeg -r RATE -i", "-c copy clip.mp4")
+    ),
+    Case(
+        "H.264 with another name",
+        holding("clip.mp4", SPS),
+        [],
+        ("raw", "ffmpeg -r RATE -i", "clip_timed.mp4"),
+    ),
+    Case("H.265 as a stream", holding("a.h265", b"\0\0\0\1\x40\1"), [], ("ffmpeg -r RATE", "-c copy a.mp4")),
+    Case(
+        "AV1",
+        lambda folder: Path(shutil.copy(CASES / "video_av1/clip.mp4", folder)),
+        [],
+        ("AV1", "ffmpeg -i", "-c:v libx264 clip_h264.mp4"),
+    ),
+    Case("another container", holding("clip.ts", b"G"), [], ("ffmpeg -i", "clip.mp4")),
+    Case("photos of an iPhone", holding("IMG_1.HEIC", b"\0\0\0\x18ftypheic", "photos"), [], ("IMG_1.jpg",)),
+    Case("a bag of ROS 1 that is open", holding("a.bag.active", b"#ROSBAG"), [], ("rosbag reindex",)),
+    Case("a packed bag", holding("a_0.db3.zstd", b"(\xb5/\xfd"), [], ("zstd -d", "-o a_0.db3")),
+    Case("a packed recording", holding("a.mcap.gz", b"\x1f\x8b"), [], ("gunzip -k",)),
+    Case("an archive", holding("tub.tar.gz", b"\x1f\x8b"), [], ("tar -xf",)),
+]
+
+
+@table(VIDEOS)
+def test_videos_and_what_becomes_one(tmp_path: Path, case: Case) -> None:
+    case.check(tmp_path)
+
+
+def test_the_times_of_a_video_are_those_of_its_frames(tmp_path: Path) -> None:
+    drive = open_drive(video(timed((20, 1), (20, 3)), frames=40)(tmp_path))
+    np.testing.assert_allclose(np.diff(drive.t_s), [0.05] * 20 + [0.15] * 19, atol=1e-4)
+    assert drive.times_trusted
+    in_order = [drive.image(i) for i in range(40)]
+    # OpenCV finds a frame by its number times the mean rate.
+    for i in (39, 5, 30, 21, 19, 0, 38):
+        np.testing.assert_array_equal(drive.image(i), in_order[i])
+    sent = pickle.loads(pickle.dumps(drive))
+    np.testing.assert_array_equal(sent.image(33), in_order[33])
+    assert not open_drive(raw_mjpeg(tmp_path)).times_trusted
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_a_video_is_turned_as_it_says(tmp_path: Path, degrees: int) -> None:
+    upright = open_drive(video()(tmp_path)).image(3)
+    drive = open_drive(video(turned(degrees), "turned.mp4")(tmp_path))
+    assert (drive.height, drive.width) == ((48, 64) if degrees % 180 == 0 else (64, 48))
+    np.testing.assert_array_equal(drive.image(3), np.rot90(upright, -degrees // 90))
 
 
 # Photos.

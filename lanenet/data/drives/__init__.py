@@ -13,6 +13,7 @@ from pathlib import Path
 
 from lanenet.data.drives import bag, folder, tub, video
 from lanenet.data.drives.folder import read_truth
+from lanenet.data.drives.others import next_step
 from lanenet.data.drives.recording import Commands, Drive, DriveFormat, assemble_drive
 from lanenet.errors import DriveFormatError, counted
 from lanenet.outputs import restore_output
@@ -70,9 +71,8 @@ def meant_instead(path: Path) -> str:
         new = shlex.quote(f"{path.name or 'tub'}_v2")
         convert = f"python scripts/convert_to_tub_v2.py --tub={shlex.quote(str(path))} --output={new}"
         return f"; a version 1 tub has to be converted by Donkeycar first, in its folder: {convert}"
-    if path.suffix == ".bag":
-        instead = f"rosbags-convert --src {shlex.quote(str(path))} --dst {shlex.quote(path.stem)}"
-        return f"; a bag of ROS 1 has to be converted first: {instead}"
+    if not is_folder(path) and (step := next_step(path)) is not None:
+        return f"; it is {step}"
     if (above := drive_above(path)) is not None:
         return f"; the drive is the folder above it: type {shlex.quote(str(above))}"
     inside = list(itertools.islice(drives_in(path, _HINT_DEPTH), _HINT_COUNT + 1))
@@ -97,11 +97,13 @@ def _photos_instead(path: Path) -> str:
     if not is_folder(path):
         return ""
     try:
-        photos = sum(map(is_photo, path.iterdir()))
+        files = sorted(path.iterdir(), key=natural_key)
     except OSError:  # a folder that cannot be read shows none
         return ""
+    photos = sum(map(is_photo, files))
     if not photos:
-        return ""
+        step = next(((file, step) for file in files if (step := next_step(file)) is not None), None)
+        return "" if step is None else f"; {step[0].name} in it is {step[1]}"
     return (
         f"; it holds {counted(photos, 'image')} without a frames.csv: single photos cannot be mapped, and "
         "lanenet detect takes each of them"
