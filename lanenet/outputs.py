@@ -38,6 +38,8 @@ _UNKNOWN_CALL = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOLCK, err
 #: So often the folder of an output is made again that is gone when its lock is. Chosen: other runs remove it
 #: once each.
 _TRIES = 100
+#: Bytes of a lock that are read: what names its owner is shorter.
+_LONGEST_OWNER = 400
 #: Locks held by this process: process, thread and output. A forked child inherits the list, not the locks.
 _held: set[tuple[int, int, Path]] = set()
 #: Temporary files and folders that this process fills.
@@ -260,7 +262,7 @@ def _lock(path: Path, stack: ExitStack) -> bool:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                owner = os.pread(handle, 200, 0).decode(errors="replace").strip() or "another run"
+                owner = os.pread(handle, _LONGEST_OWNER, 0).decode(errors="replace").strip() or "another run"
                 raise LanenetError(
                     f"{path}: is being written by {owner}; wait until that has ended, or choose another name"
                 ) from None
@@ -270,6 +272,11 @@ def _lock(path: Path, stack: ExitStack) -> bool:
                 lock.unlink(missing_ok=True)
                 shared = False
                 continue
+            if not re.fullmatch(rb"(process \d+ on .*\n)?", os.pread(handle, _LONGEST_OWNER, 0)):
+                raise LanenetError(
+                    f"{path}: cannot be locked, {lock} is not a lock of lanenet and stays as it is; choose "
+                    "another name"
+                )
             # The last owner removes the file: the lock counts if the file still has its name.
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(handle), lock.stat()):

@@ -51,11 +51,13 @@ def label_all(
         find_tracks: Recognise the track of drives that name none, which compares all pairs of maps.
 
     Raises:
-        LanenetError: If another run writes there, or the engine cannot be started.
+        LanenetError: If another run writes there, if files of others have the names that are used there, or
+            if the engine cannot be started.
     """
     with ExitStack() as stack:
         if storage.folder is not None:
             stack.enter_context(lock_output(storage.folder))
+        storage.claim()
         for kind in (MAPS, LABELS, CAMERAS, TRACKS):
             storage.sweep(kind)
         run = _Run(settings, storage, engine, progress, refused_again)

@@ -4,11 +4,17 @@ A result is finished once its marker is there. On a file system a result is fill
 gets its own name in one step, marker and all. An object store has no such step: there the marker is written
 last. Either way a result is there as a whole or not at all, and what a lost worker left of one is known by
 its missing marker, see :meth:`Storage.sweep`.
+
+Only what a run made is ever removed: a storage is marked before anything is written into it, while none of
+the names that are used in it is taken, and below it only results and unfinished ones, known by their names,
+are touched.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import re
 import secrets
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -23,8 +29,18 @@ from lanenet.reading import parsing
 
 #: The marker of a finished result, and what is known of it.
 RESULT_NAME = "result.json"
+#: The marker of the storage itself, and what it says.
+MARK_NAME = "fleet.yaml"
+_MARK = "format: lanenet-fleet/1"
+#: What a run writes into its storage; none of it may be there when the storage is marked.
+OWN_NAMES = (
+    *("maps", "labels", "cameras", "tracks", "drives.json", "index.html"),
+    *("checksums.json", "alike.json", "label-all.log"),
+)
 #: Begins the name of a folder that is being filled.
 _TEMPORARY = ".new-"
+#: Names below a kind: results, unfinished ones, and the locks and temporary files of these.
+_OWN = re.compile(r"[0-9a-f]{16}|\.{1,2}new-[0-9a-f]{16}-[0-9a-f]{8}(\..*)?")
 
 
 def open_url(url: str) -> tuple[Any, str]:
@@ -102,8 +118,47 @@ class Storage:
         found = self._system.cat(list(paths), on_error="omit") if paths else {}
         return {paths[path]: data for path, data in found.items()}
 
+    @property
+    def is_marked(self) -> bool:
+        """Whether the storage was marked by :meth:`claim`."""
+        return (self.read(MARK_NAME) or b"").startswith(_MARK.encode())
+
+    def claim(self) -> None:
+        """Mark the storage, unless it is marked: from now on :data:`OWN_NAMES` in it are those of runs.
+
+        Raises:
+            LanenetError: If it is not marked and holds one of them.
+        """
+        if self.is_marked:
+            return
+        taken = [name for name in (*OWN_NAMES, MARK_NAME) if self._is_taken(name)]
+        if taken:
+            raise LanenetError(
+                f"{self.url}: has {', '.join(taken)}, which label-all did not make (no {MARK_NAME} of "
+                "lanenet), so nothing is written or removed there; choose another --out, or, if an earlier "
+                f"version of lanenet made all of it, write the line {_MARK!r} into {MARK_NAME} there"
+            )
+        self._put(
+            MARK_NAME, f"{_MARK}\n# Made by lanenet label-all, which clears up in this folder.\n".encode()
+        )
+
+    def _is_taken(self, name: str) -> bool:
+        """Tell whether there is anything of a name but an empty folder; a link that leads nowhere counts."""
+        if self.folder is None:
+            return bool(self._system.exists(self._at(name)))
+        path = self.folder / name
+        return os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))
+
     def write(self, name: str, data: bytes) -> None:
-        """Write a file beside the results, as a whole."""
+        """Write a file beside the results, as a whole.
+
+        Raises:
+            LanenetError: As :meth:`claim`.
+        """
+        self.claim()
+        self._put(name, data)
+
+    def _put(self, name: str, data: bytes) -> None:
         if self.folder is not None:
             write_bytes(self.folder / name, data)
             return
@@ -151,19 +206,27 @@ class Storage:
     def sweep(self, kind: str, also: Iterable[str] = ()) -> None:
         """Remove what lost workers left of results that they had begun. Only while nobody writes there.
 
+        What has another name than results have stays, and so do links, and all of a storage without a mark.
+
         Args:
             kind: Of the results.
             also: Keys of finished results that are not wanted any more.
         """
-        if not self._system.exists(self._at(kind)):
+        if not (self._system.exists(self._at(kind)) and self.is_marked):
             return
         names = {PurePosixPath(path).name for path in self._system.ls(self._at(kind), detail=False)}
+        names = {name for name in names if _OWN.fullmatch(name) and not self._is_link(kind, name)}
         unwanted = names & set(also)
         for key in unwanted:
             self._system.rm(self._at(kind, key, RESULT_NAME))
         for name in unwanted | (names - self.finished(kind)):
-            if self._system.exists(self._at(kind, name)):  # an object store's folder goes with its files
+            if self.folder is not None:
+                remove(self.folder / kind / name)
+            elif self._system.exists(self._at(kind, name)):  # the folder went with its files
                 self._system.rm(self._at(kind, name), recursive=True)
+
+    def _is_link(self, kind: str, name: str) -> bool:
+        return self.folder is not None and (self.folder / kind / name).is_symlink()
 
     def _upload(self, folder: Path, kind: str, key: str) -> None:
         """Write a result into an object store, its marker last.

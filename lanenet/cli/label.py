@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import check_ending, check_not_source, lock_outputs
+from lanenet.cli.shared.options import check_beside, check_ending, check_not_source, lock_outputs
 
 if TYPE_CHECKING:
     from datagen.pipeline import Report
@@ -56,7 +56,9 @@ def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | N
     from lanenet.perception.edges.road import COLOUR_WEIGHT
 
     check_ending(out, ".parquet")
-    check_not_source(map_folder, out, out.with_suffix(".json"), out.with_suffix(".png"))
+    beside = (out.with_suffix(".json"), out.with_suffix(".png"))
+    check_not_source(map_folder, out, *beside)
+    check_beside(out, *beside)
     lock_outputs(out)
     with console.progress_bar("label") as progress:
         weight = COLOUR_WEIGHT if colour_weight is None else colour_weight

@@ -146,6 +146,7 @@ def label_all(
     storage = Storage(_full(out))
     chosen = engine_of(engine, address, workers)
     with ExitStack() as stack:
+        storage.claim()
         if storage.folder is not None:
             storage.folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(console.log_file(storage.folder / _LOG_NAME))

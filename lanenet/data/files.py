@@ -7,10 +7,12 @@ crash, a full disk or Ctrl-C never leaves half a file under the final name. One 
 
 from __future__ import annotations
 
+import fnmatch
 import importlib
 import json
 import math
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +37,22 @@ FOLDER_KINDS: dict[str, tuple[str, ...]] = {
     "refused": ("refused.yaml", "report.html"),
     "export": ("export.yaml", "README.md", "camera.yaml"),
     "checkpoint": ("checkpoint.yaml", "config.yaml", "metrics.json", "weights.safetensors", "model.onnx"),
+}
+#: Patterns of what else lanenet writes into such folders. All other names in them are those of others, and
+#: stay when the folder is replaced.
+_ALSO_MADE: dict[str, tuple[str, ...]] = {
+    "drive": ("camera.yaml", "images", "truth.csv", "track.json", "simulation.yaml"),
+    "map": (
+        *("open_loop.tum", "map.png", "frames.png", "report.html", "map.done.json"),
+        *("refused.yaml", "report-refused.html", "result.json", "thumbnail.jpg"),
+    ),
+    "joined": ("map.png", "result.json", "thumbnail.jpg"),
+    "refused": (),
+    "export": ("images", "train", "labels.parquet", "annotations.json", "label_data.json"),
+    "checkpoint": (
+        *("run.yaml", "camera.yaml", "example.*", "robustness.json", "report.html", "results*", "curve.*"),
+        *("*_rasters.png", "MODEL_CARD.md", "DATA_SHEET.md", "data_sheet.json"),
+    ),
 }
 
 
@@ -92,7 +110,8 @@ def atomic_folder(path: Path, kind: str, check: Callable[[Path], object] | None 
     """Fill a folder under a temporary name and move it to ``path`` when the block ends well.
 
     An existing folder is replaced only if it is empty or an earlier output: it must hold ``<kind>.yaml`` with
-    ``format: lanenet-<kind>/...``. The new folder has to hold all files of :data:`FOLDER_KINDS`.
+    ``format: lanenet-<kind>/...``. The new folder has to hold all files of :data:`FOLDER_KINDS`. What others
+    put into the old folder lies in the new one, too.
 
     Args:
         path: Destination; missing parent folders are made.
@@ -113,11 +132,13 @@ def atomic_folder(path: Path, kind: str, check: Callable[[Path], object] | None 
             temporary.mkdir()
             yield temporary
             _check_complete(temporary, path, kind, check)
-            for inside in sorted(temporary.rglob("*")):
-                sync_path(inside)
-            sync_path(temporary)
             # The destination may have changed while the block ran.
             check_replaceable(path, kind)
+            _keep_others(path, temporary, kind)
+            for inside in sorted(temporary.rglob("*")):
+                if not inside.is_symlink() and (inside.is_file() or inside.is_dir()):
+                    sync_path(inside)
+            sync_path(temporary)
             put_in_place(temporary, path)
 
 
@@ -163,6 +184,11 @@ def check_replaceable(path: Path, kind: str) -> None:
         raise LanenetError(
             f"{path}: the folder is not empty and holds no {kind}.yaml of lanenet, so it is not replaced; "
             "choose another name or remove it"
+        )
+    if kind == "drive" and not (path / "truth.csv").is_file():
+        raise LanenetError(
+            f"{path}: holds a drive without truth.csv, so one that was recorded and cannot be made again; it "
+            "is not replaced, choose another name"
         )
 
 
@@ -231,6 +257,31 @@ def _check_complete(folder: Path, path: Path, kind: str, check: Callable[[Path],
             check(folder)
     except LanenetError as error:
         raise LanenetError(f"{path}: not written: the new {kind} cannot be read ({error})") from error
+
+
+def _keep_others(path: Path, new: Path, kind: str) -> None:
+    """Copy what others put into a folder into the one that replaces it, as hard links where possible."""
+    if not path.is_dir():
+        return
+    made = [*FOLDER_KINDS[kind], *_ALSO_MADE[kind]]
+    if kind == "joined" and _holds_marker(path, kind):
+        members = read_yaml(path / "joined.yaml").get("drives")
+        made += [str(one.get("map")) for one in members or () if isinstance(one, dict)]
+    for own in path.iterdir():
+        kept = new / own.name
+        if kept.exists() or any(fnmatch.fnmatchcase(own.name, pattern) for pattern in made):
+            continue
+        if own.is_dir() and not own.is_symlink():
+            shutil.copytree(own, kept, symlinks=True, copy_function=_link_or_copy)
+        else:
+            _link_or_copy(str(own), str(kept))
+
+
+def _link_or_copy(source: str, target: str) -> None:
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:  # a file system without links
+        shutil.copy2(source, target, follow_symlinks=False)
 
 
 def _holds_marker(path: Path, kind: str) -> bool:

@@ -12,7 +12,13 @@ import numpy as np
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import MappingOption, check_ending, check_not_source, lock_outputs
+from lanenet.cli.shared.options import (
+    MappingOption,
+    check_beside,
+    check_ending,
+    check_not_source,
+    lock_outputs,
+)
 from lanenet.errors import CalibrationError, ConfigError, HardwareError, counted
 
 if TYPE_CHECKING:
@@ -85,7 +91,9 @@ def localise(
         raise ConfigError(
             "expected either SOURCE or --live CONFIG, found " + ("both" if given else "neither")
         )
-    check_not_source(given, out, out.with_suffix(".tum"), out.with_suffix(".png"))
+    beside = (out.with_suffix(".tum"), out.with_suffix(".png"))
+    check_not_source(given, out, *beside)
+    check_beside(out, *beside)
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     start = StartSettings(frames=start_frames, factor=factor)
     if live is None:

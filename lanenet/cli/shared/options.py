@@ -208,6 +208,22 @@ def check_not_source(source: Path, *outs: Path | None) -> None:
             raise ConfigError(f"{out}: {found}; choose another name: {out.with_stem(f'{out.stem}_out')}")
 
 
+def check_beside(out: Path, *others: Path) -> None:
+    """Refuse to replace files that nobody named: those that a command writes beside its output.
+
+    Files beside an output that is there are those of the last run.
+
+    Raises:
+        ConfigError: Names the file.
+    """
+    taken = [] if out.exists() else [path for path in others if path.exists()]
+    if taken:
+        raise ConfigError(
+            f"{taken[0]}: is there already, and would be replaced by what is written beside {out.name}; "
+            f"choose another name: {out.with_stem(f'{out.stem}_out')}"
+        )
+
+
 def _belongs_to(source: Path, resolved: Path, out: Path) -> bool:
     # Imported here: commands that read no drive need not wait for OpenCV.
     from lanenet.data.drives import FORMATS, PHOTO_ENDINGS, find_format

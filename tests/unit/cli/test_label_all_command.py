@@ -72,6 +72,28 @@ def test_a_failed_drive_gives_code_1_and_its_reason(tmp_path: Path, faults: None
     )
 
 
+def test_files_of_others_stay_also_behind_links(tmp_path: Path, faults: None):
+    write_drive(tmp_path / "drives" / "a")
+    out, album = tmp_path / "out", tmp_path / "album"
+    for file in (out / "maps" / ("0" * 16) / "mine.txt", out / "index.html", album / "photo.jpg"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("mine")
+    (out / "labels").symlink_to(album)
+    before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
+    found = invoke(tmp_path / "drives", "--out", out)
+    assert (
+        found.exit_code == 1 and "has maps, labels, index.html, which label-all did not make" in found.output
+    )
+    assert {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    # Beside them, and in a folder that is marked.
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "notes.txt").write_text("mine")
+    for _ in range(2):
+        assert invoke(tmp_path / "drives", "--out", tmp_path / "new", "--refused-again").exit_code == 0
+        (tmp_path / "new" / "maps" / "photo.jpg").write_text("mine")
+    assert (tmp_path / "new" / "notes.txt").exists() and (tmp_path / "new" / "maps" / "photo.jpg").exists()
+
+
 def test_an_address_is_one_of_ray_and_without_it_processes_do_the_work():
     assert engine_of(None, None, 3) == engine_of(EngineName.local, None, 3) == LocalEngine(3)
     assert engine_of(EngineName.ray, None, 3) == RayEngine(None, 3)

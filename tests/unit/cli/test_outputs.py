@@ -93,6 +93,19 @@ def test_the_video_of_answers_gets_another_name_than_its_source(tmp_path):
     assert "a_lanes.mp4" in result.stdout.rpartition("next: ")[2]
 
 
+@pytest.mark.parametrize(
+    ("verb", "out", "beside"), [("label", "a.parquet", "a.png"), ("localise", "a.csv", "a.tum")]
+)
+def test_what_nobody_named_is_not_replaced(tmp_path, verb, out, beside):
+    drive = touched(tmp_path / "drive", "map.yaml")
+    touched(tmp_path, beside)
+    line = refused(tmp_path, verb, drive, "--out", tmp_path / out)
+    assert f"{beside}: is there already" in line and f"a_out{Path(out).suffix}" in line
+    # Of the last run.
+    touched(tmp_path, out)
+    assert "is there already" not in refused(tmp_path, verb, drive, "--out", tmp_path / out)
+
+
 def test_endings(tmp_path):
     check_ending(tmp_path / "a.CSV", ".parquet", ".csv")
     with pytest.raises(ConfigError, match=r"a\.txt: expected a name that ends in \.parquet or \.csv"):

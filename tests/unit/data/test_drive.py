@@ -192,9 +192,15 @@ def test_an_error_while_writing_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_a_drive_replaces_a_drive_and_nothing_else(tmp_path: Path) -> None:
-    write_drive(tmp_path / "lap", 5)
-    write_drive(tmp_path / "lap", 2)
+    for count in (5, 2):
+        with DriveWriter(tmp_path / "lap") as writer:
+            for k in range(count):
+                writer.add(frame_image(k), 0.1 * k, truth=truth_row(k))
     assert len(open_drive(tmp_path / "lap")) == 2
+    write_drive(tmp_path / "recorded", 5)
+    with pytest.raises(LanenetError, match=r"without truth\.csv, so one that was recorded"):
+        write_drive(tmp_path / "recorded", 2)
+    assert len(open_drive(tmp_path / "recorded")) == 5
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.jpg").write_text("mine")
     with pytest.raises(LanenetError, match="not replaced"):

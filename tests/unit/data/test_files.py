@@ -85,8 +85,9 @@ def test_a_link_keeps_pointing_at_its_file(tmp_path: Path) -> None:
 def fill(folder: Path, text: str) -> None:
     (folder / "drive.yaml").write_text("format: lanenet-drive/1\n")
     (folder / "frames.csv").write_text("frame,t_s,file\n")
-    (folder / "deep").mkdir()
-    (folder / "deep" / "a.txt").write_text(text)
+    (folder / "truth.csv").write_text("frame\n")
+    (folder / "images").mkdir()
+    (folder / "images" / "a.txt").write_text(text)
 
 
 def make_folder(path: Path, text: str) -> None:
@@ -97,11 +98,60 @@ def make_folder(path: Path, text: str) -> None:
 def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
     path = tmp_path / "out"
     make_folder(path, "one")
-    (path / "stale.txt").write_text("from the first run")
+    (path / "images" / "stale.txt").write_text("from the first run")
     make_folder(path, "two")
-    assert (path / "deep" / "a.txt").read_text() == "two"
-    assert names(path) == ["deep", "drive.yaml", "frames.csv"]
+    assert (path / "images" / "a.txt").read_text() == "two"
+    assert names(path) == ["drive.yaml", "frames.csv", "images", "truth.csv"]
     assert names(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_what_others_put_into_a_folder_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *_, **__: (_ for _ in ()).throw(OSError("no links here")))
+    path, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    make_folder(path, "one")
+    elsewhere.mkdir()
+    (elsewhere / "photo.jpg").write_text("far")
+    (path / "notes.txt").write_text("mine")
+    (path / "lanes" / "deep").mkdir(parents=True)
+    (path / "lanes" / "deep" / "b.csv").write_text("mine, too")
+    (path / "album").symlink_to(elsewhere)
+    (path / "nowhere").symlink_to(tmp_path / "gone")
+    for text in ("two", "three"):
+        make_folder(path, text)
+    assert (path / "images" / "a.txt").read_text() == "three"
+    assert (path / "notes.txt").read_text() == "mine"
+    assert (path / "lanes" / "deep" / "b.csv").read_text() == "mine, too"
+    assert (path / "album").is_symlink() and (path / "nowhere").is_symlink()
+    assert names(elsewhere) == ["photo.jpg"]
+
+
+def test_maps_of_others_in_a_joined_folder_stay(tmp_path: Path) -> None:
+    def join(*members: str) -> None:
+        with atomic_folder(tmp_path / "track", "joined") as folder:
+            drives = "".join(f"- {{map: {name}}}\n" for name in members)
+            (folder / "joined.yaml").write_text(f"format: lanenet-joined/1\ndrives:\n{drives}")
+            (folder / "join.json").write_text("{}")
+            for name in members:
+                (folder / name).mkdir()
+
+    join("monday", "tuesday")
+    (tmp_path / "track" / "my_map").mkdir()
+    join("monday", "friday")
+    assert names(tmp_path / "track") == ["friday", "join.json", "joined.yaml", "monday", "my_map"]
+
+
+def test_a_drive_that_was_recorded_is_not_replaced(tmp_path: Path) -> None:
+    """People write drive.yaml into their tubs, and a recorder writes one."""
+    path = tmp_path / "tub"
+    make_folder(path, "one")
+    (path / "truth.csv").unlink()
+    with pytest.raises(LanenetError, match=r"tub: holds a drive without truth\.csv"):
+        make_folder(path, "two")
+    assert (path / "images" / "a.txt").read_text() == "one"
 
 
 def test_an_error_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None:
@@ -110,14 +160,14 @@ def test_an_error_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None
     with pytest.raises(KeyboardInterrupt), atomic_folder(path, "drive") as temporary:
         (temporary / "half.txt").write_text("x")
         raise KeyboardInterrupt
-    assert (path / "deep" / "a.txt").read_text() == "one"
+    assert (path / "images" / "a.txt").read_text() == "one"
     assert names(tmp_path) == ["out"]
 
 
 def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     make_folder(tmp_path / "out", "one")
-    assert names(tmp_path / "out") == ["deep", "drive.yaml", "frames.csv"]
+    assert names(tmp_path / "out") == ["drive.yaml", "frames.csv", "images", "truth.csv"]
 
 
 @pytest.mark.parametrize(
@@ -190,7 +240,7 @@ def test_a_folder_that_lost_a_file_replaces_nothing(tmp_path: Path, lost: str) -
             (temporary / name).unlink(missing_ok=True)
         if lost == "its text":
             (temporary / "frames.csv").write_text("")
-    assert (path / "deep" / "a.txt").read_text() == "one"
+    assert (path / "images" / "a.txt").read_text() == "one"
     assert names(tmp_path) == ["out"]
 
 
@@ -204,7 +254,7 @@ def test_a_folder_that_cannot_be_read_replaces_nothing(tmp_path: Path) -> None:
     refused = pytest.raises(LanenetError, match=r"out: not written: .*frames\.csv: line 7")
     with refused, atomic_folder(path, "drive", check) as temporary:
         fill(temporary, "two")
-    assert (path / "deep" / "a.txt").read_text() == "one"
+    assert (path / "images" / "a.txt").read_text() == "one"
 
 
 def test_a_folder_is_on_the_disk_before_it_gets_its_name_and_its_name_after(
@@ -226,6 +276,7 @@ def test_a_folder_is_on_the_disk_before_it_gets_its_name_and_its_name_after(
     monkeypatch.setattr(outputs, "exchange", exchanged)
     make_folder(tmp_path / "out", "two")
     new = tmp_path / "new"
-    files = [new / "deep", new / "deep" / "a.txt", new / "drive.yaml", new / "frames.csv", new]
+    inside = ("images", "images/a.txt", "drive.yaml", "frames.csv", "truth.csv")
+    files = [*(new / name for name in inside), new]
     assert sorted(done[:-2]) == sorted(map(str, files)) and done[-3] == str(new)
     assert done[-2:] == ["exchange", str(tmp_path)]

@@ -13,7 +13,7 @@ from small_map import small_map
 
 from lanenet import outputs
 from lanenet.data.drives import open_drive
-from lanenet.data.drives.folder import DriveWriter
+from lanenet.data.drives.folder import TRUTH_NAMES, DriveWriter
 from lanenet.data.drives.recorder import DriveRecorder, RecordingSettings
 from lanenet.data.files import atomic_folder, write_json, write_text
 from lanenet.data.maps.folder import check_map_files, read_map, write_map
@@ -61,7 +61,10 @@ def test_a_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: boo
     def write(number: int) -> None:
         with DriveWriter(tmp_path / "one", CAMERA) as writer:
             for k in range(2):
-                writer.add(frame_image(k), 0.05 * k, speed_cm_s=float(number))
+                # Only what was simulated is replaced.
+                writer.add(
+                    frame_image(k), 0.05 * k, dict.fromkeys(TRUTH_NAMES, 0.0), speed_cm_s=float(number)
+                )
 
     def read() -> int:
         drive = open_drive(tmp_path / "one")

@@ -117,6 +117,23 @@ def test_the_holder_may_take_its_lock_again_and_nobody_else(tmp_path: Path) -> N
     assert in_a_thread(out) == ""
 
 
+def test_a_lock_of_another_program_is_left_alone(tmp_path: Path) -> None:
+    lock = tmp_path / ".out.lock"
+    lock.write_text("of another program\n")
+    with (
+        pytest.raises(LanenetError, match=r"\.out\.lock is not a lock of lanenet"),
+        lock_output(tmp_path / "out"),
+    ):
+        pass
+    assert lock.read_text() == "of another program\n"
+    # Of a run that was killed, with and without room for its name.
+    for text in ("process 7 on somewhere\n", ""):
+        lock.write_text(text)
+        with lock_output(tmp_path / "out"):
+            pass
+        assert names(tmp_path) == []
+
+
 def test_a_folder_in_which_nothing_can_be_made_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

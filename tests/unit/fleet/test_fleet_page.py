@@ -89,6 +89,7 @@ def test_of_many_drives_some_are_shown_and_none_is_large():
 
 def test_the_page_is_written_with_the_maps_that_have_a_picture(tmp_path: Path):
     storage = Storage(str(tmp_path))
+    storage.claim()
     for k in (0, 1):
         with storage.new("maps", f"map-{k}") as folder:
             (folder / "result.json").write_text("{}")

@@ -20,7 +20,7 @@ from datagen.fleet.checksums import with_checksums
 from datagen.fleet.engine import Ended, Task
 from datagen.fleet.run import label_all
 from datagen.fleet.source import checksum
-from datagen.fleet.storage import Storage
+from datagen.fleet.storage import MARK_NAME, OWN_NAMES, Storage
 from datagen.fleet.task import FleetSettings
 from datagen.fleet.work import Outcome
 from datagen.settings import MapSettings
@@ -37,6 +37,8 @@ def test_a_drive_becomes_a_map_and_a_label_set(tiny: Path, labelled: Path):
     assert mapped["took"]["cpu_s"] > 0 and mapped["took"]["peak_bytes"] > 1e8 and mapped["bytes"] > 1e5
     assert (labelled / index["map"] / "thumbnail.jpg").read_bytes()[:2] == b"\xff\xd8"
     assert not list(labelled.glob("*/.*"))
+    # All of which the storage asks whether others have it.
+    assert {path.name for path in labelled.iterdir()} <= {*OWN_NAMES, MARK_NAME}
 
 
 def test_a_second_run_does_nothing(tiny: Path, labelled: Path):

@@ -83,20 +83,78 @@ def test_the_first_of_two_workers_stays(storage: Storage):
     assert files_of(storage) == ["/maps/a/inside/data.txt", "/maps/a/result.json"]
 
 
-def test_sweeping_removes_what_was_begun_and_keeps_what_is_finished(storage: Storage):
-    fill(storage, "done")
-    fill(storage, "other")
+DONE, OTHER, BEGUN = (letter * 16 for letter in "abc")
+
+
+def put(storage: Storage, *paths: str) -> None:
     system, root = fsspec.core.url_to_fs(storage.url)
-    # As a killed worker leaves it: under a temporary name, or without a marker; and a lock.
-    for path in ("maps/.new-b-12/result.json", "maps/c/labels.parquet", "maps/..new-b-12.lock"):
+    for path in paths:
         system.makedirs(f"{root}/{path}".rpartition("/")[0], exist_ok=True)
         system.pipe_file(f"{root}/{path}", b"{}")
-    assert storage.finished("maps") == {"done", "other"}
+
+
+def test_sweeping_removes_what_was_begun_and_keeps_what_is_finished(storage: Storage):
+    storage.claim()
+    fill(storage, DONE)
+    fill(storage, OTHER)
+    # As a killed worker leaves it: under a temporary name, or without a marker; and a lock.
+    new = f"new-{BEGUN}-0123abcd"
+    put(storage, f"maps/.{new}/result.json", f"maps/{BEGUN}/labels.parquet", f"maps/..{new}.lock")
+    assert storage.finished("maps") == {DONE, OTHER}
     storage.sweep("maps")
-    assert {file.split("/")[2] for file in files_of(storage)} == {"done", "other"}
-    storage.sweep("maps", {"other", "never there"})
-    assert storage.finished("maps") == {"done"}
+    assert {file.split("/")[2] for file in files_of(storage) if "maps" in file} == {DONE, OTHER}
+    storage.sweep("maps", {OTHER, "never there"})
+    assert storage.finished("maps") == {DONE}
     storage.sweep("labels")
+
+
+def test_sweeping_leaves_what_others_put_there(storage: Storage, tmp_path: Path):
+    storage.claim()
+    fill(storage, DONE)
+    mine = ["maps/holiday.jpg", "maps/2024/photo.jpg", "maps/result.json", "maps/.new-idea/a.txt"]
+    put(storage, *mine)
+    if storage.folder is not None:
+        (tmp_path / "far").mkdir()
+        (tmp_path / "far" / "a.txt").write_text("far")
+        # By the name of a result, which never is a link.
+        (storage.folder / "maps" / OTHER).symlink_to(tmp_path / "far")
+    storage.sweep("maps", {OTHER})
+    assert {f"/{path}" for path in mine} <= set(files_of(storage))
+    if storage.folder is not None:
+        assert (storage.folder / "maps" / OTHER / "a.txt").read_text() == "far"
+
+
+def test_a_folder_with_files_of_others_is_not_claimed(storage: Storage):
+    put(storage, f"maps/{BEGUN}/photo.jpg")
+    for use in (storage.claim, lambda: storage.write("index.html", b"")):
+        with pytest.raises(LanenetError, match=r"has maps, which .* did not make .*nothing is written"):
+            use()
+    storage.sweep("maps", {BEGUN})
+    assert files_of(storage) == [f"/maps/{BEGUN}/photo.jpg"]
+    # As the message says, for what an earlier version made.
+    put(storage, "fleet.yaml")
+    with pytest.raises(LanenetError, match=r"has maps, fleet\.yaml"):
+        storage.claim()
+    storage.sweep("maps")
+    assert f"/maps/{BEGUN}/photo.jpg" in files_of(storage)
+    system, root = fsspec.core.url_to_fs(storage.url)
+    system.pipe_file(f"{root}/fleet.yaml", b"format: lanenet-fleet/1")
+    storage.claim()
+    storage.sweep("maps")
+    assert files_of(storage) == ["/fleet.yaml"]
+
+
+def test_other_names_beside_the_own_ones_do_not_matter(tmp_path: Path):
+    (tmp_path / "tub").mkdir()
+    (tmp_path / "tub" / "manifest.json").touch()
+    (tmp_path / "maps").mkdir()  # empty
+    storage = Storage(str(tmp_path))
+    storage.claim()
+    assert storage.is_marked
+    (tmp_path / "fleet.yaml").unlink()
+    (tmp_path / "labels").symlink_to(tmp_path / "gone")
+    with pytest.raises(LanenetError, match="has labels,"):
+        storage.claim()
 
 
 def test_files_beside_the_results(storage: Storage):
