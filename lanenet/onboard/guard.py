@@ -27,7 +27,7 @@ from lanenet.errors import HardwareError, LanenetError
 from lanenet.onboard.actuators.actuator import Actuator, Spare
 from lanenet.onboard.guard_process import DRIVE, MESSAGE, NEUTRAL, QUIT
 from lanenet.onboard.i2c import GUARD_MODULE
-from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, settle, undisturbed
+from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
 from lanenet.search_path import without_working_folder
 
 log = logging.getLogger(__name__)
@@ -153,7 +153,7 @@ class GuardedActuator:
         Raises:
             HardwareError: If the actuator does not answer; the message is the guard's.
         """
-        self._spare = _spare_of(self._make_actuator())
+        self._left, self._spare = None, _spare_of(self._make_actuator())
         ours, theirs = socket.socketpair()
         heard, pulse = os.pipe()
         try:
@@ -169,6 +169,8 @@ class GuardedActuator:
         except BaseException:
             os.close(heard)
             ours.close()
+            if self._spare is not None:
+                self._spare.release()
             raise
         finally:
             os.close(pulse)
@@ -254,7 +256,8 @@ class GuardedActuator:
             self._hear_out(end_s + _LATE_S)
             if not self._closed:
                 self._kill()
-                if self._ready:
+                # A guard that died while it started may have left the motor of an earlier drive running.
+                if self._ready or self._spare is not None:
                     self._left = settle(self._rescue, patience_s=max(end_s - time.monotonic(), 0.0))
             if self._watch is not None:
                 self._watch.end()
@@ -323,7 +326,7 @@ class GuardedActuator:
         elif word == "ready":
             self._ready = True
         elif word == "neutral":
-            log.debug("the guard went to neutral: %s", text)
+            log.debug("the guard: %s", text)
         elif word == "stopped":
             self._stopped = True
         elif word == "closed":
@@ -355,8 +358,7 @@ class GuardedActuator:
         else:
             actuator = self._make_actuator()
             try:
-                actuator.open()
-                left = actuator.neutral()
+                left = reach_neutral(actuator)
             finally:
                 actuator.close()
         return left or Neutral(False, "the actuator cannot be opened")
@@ -410,14 +412,15 @@ class _Watch:
                 log.warning("the guard of the actuator has been silent for %g s: %s", _SILENT_S, text)
             silent = True
         os.close(self._heard)
+        if self._spare is None or self._over:
+            return
         # The guard is gone. A loop that is not held up finds that out, too, and takes over.
-        end_s = time.monotonic() + PATIENCE_S
-        while self._spare is not None and not self._over and time.monotonic() < end_s:
-            left = self._spare.neutral()
-            if left is None or left.confirmed:
-                return
-            time.sleep(AGAIN_S)
+        left = settle(self._spare.neutral)
+        if left is not None and left.confirmed is False and not self._over:
+            log.critical("the guard of the actuator is gone: %s", left.may_run)
 
     def _neutral(self) -> str:
-        left = None if self._spare is None else self._spare.neutral()
-        return "its own watchdog has to stop the motor" if left is None else left.text
+        if self._spare is None:
+            return "a watchdog of the actuator's own has to stop the motor"
+        left = self._spare.neutral()
+        return "not open" if left is None else left.text

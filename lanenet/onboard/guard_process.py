@@ -3,9 +3,10 @@
 :mod:`lanenet.onboard.guard` starts it with the arguments ``LINE PULSE SETTINGS FIRST WATCHDOG_S GIVE_UP_S``:
 the numbers of an open socket and of a pipe, the actuator's settings and its first writes as JSON. The loop
 sends messages of fixed size; the guard answers with lines of text: ``ready``, ``ok NUMBER`` for each message,
-``neutral REASON``, ``failed REASON``, ``stopped`` if it was asked to end, and at its end ``closed STATE``:
-the fields of a :class:`lanenet.onboard.neutral.Neutral` as JSON, null if the actuator was not reached. Into
-the pipe goes a byte at every turn, so that the loop's process sees at once that the guard is stopped or gone.
+``neutral STATE: REASON``, ``failed REASON``, ``stopped`` if it was asked to end, and at its end ``closed``
+with the fields of a :class:`lanenet.onboard.neutral.Neutral` as JSON, null if the actuator was not reached.
+Into the pipe goes a byte at every turn, so that the loop's process sees at once that the guard is stopped or
+gone.
 
 At its end the guard repeats neutral until the actuator confirms it (:mod:`lanenet.onboard.neutral`).
 
@@ -30,12 +31,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 from typing import TYPE_CHECKING
 
 from lanenet.errors import LanenetError, MotorMayRunError
 from lanenet.onboard.i2c import I2CChip
-from lanenet.onboard.neutral import Neutral, settle
+from lanenet.onboard.neutral import Neutral, reach_neutral, settle
 
 if TYPE_CHECKING:
     from lanenet.onboard.actuators.actuator import Actuator
@@ -73,6 +75,8 @@ class Guard:
         self._command = (0.0, 0.0)
         #: When the actuator was last told something.
         self._told_s = -math.inf
+        #: Since when the actuator does not confirm neutral; infinite while it does.
+        self._doubt_s = math.inf
         #: Why no command is accepted any more; empty while they are.
         self._over = ""
         #: When the present call of the driver began; infinite if there is none.
@@ -173,7 +177,7 @@ class Guard:
         if self._driving and now_s >= self._until_s:
             text = self._neutral()
             reason = f"no command from the drive loop for {1e3 * (now_s - self._heard_s):.0f} ms"
-            self._say(f"neutral {reason}")
+            self._say(f"neutral {text}: {reason}")
             # A loop that hangs cannot log it. Once a second at most: a slow camera lets every command expire.
             if now_s - self._logged_s > 1.0:
                 self._logged_s = now_s
@@ -190,7 +194,16 @@ class Guard:
         """Send neutral; returns what is known of it, in words."""
         with self._busy():
             left = self._actuator.neutral()
-        self._driving, self._told_s = False, time.monotonic()
+        beat(self._pulse)
+        now_s = time.monotonic()
+        self._driving, self._told_s = False, now_s
+        if left is None or left.confirmed is not False:
+            self._doubt_s = math.inf
+        elif now_s - self._doubt_s > self._give_up_s and not self._over:
+            self._over = f"the actuator does not confirm neutral: {left.why}"
+            self._say(f"failed {self._over}")
+        else:
+            self._doubt_s = min(self._doubt_s, now_s)
         return "not open" if left is None else left.text
 
     def _say(self, text: str) -> None:
@@ -348,7 +361,9 @@ def _leave(actuator: Actuator, pulse: int) -> Neutral | None:
         beat(pulse)
         return True
 
-    left = settle(actuator.neutral, turn)
+    # A board whose plug slipped is opened again; one that could not be opened at all is left alone.
+    reached = actuator.neutral() is not None
+    left = settle(partial(reach_neutral, actuator), turn) if reached else None
     if left is None or left.confirmed is not False:
         _close(actuator)
     return left

@@ -29,7 +29,7 @@ from lanenet.onboard.arming import ArmGate, HoldFile
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.frame_check import FrameCheck
 from lanenet.onboard.guard import CommandSink, StoppedError
-from lanenet.onboard.neutral import ENDING
+from lanenet.onboard.neutral import ENDING, undisturbed
 from lanenet.onboard.safety import (
     CommandLimiter,
     LimitSettings,
@@ -179,15 +179,16 @@ class DriveLoop:
                     failure = error
                     when = "before the first frame" if self._number < 0 else f"in frame {self._number}"
                     self.report.ended = f"{type(error).__name__} {when}: {error}"
-            self._parts.sink.neutral()
-            try:
+            with undisturbed():
+                self._parts.sink.neutral()
                 left = self._parts.sink.close()
-            finally:
-                self._close()
-        end = f"{'ended' if left is None else left.text}: {self.report.ended}"
-        log.log(logging.INFO if failure is None else logging.ERROR, "%s", end)
-        if left is not None and left.confirmed is False:
-            raise MotorMayRunError(f"{left.may_run}; ended: {self.report.ended}") from failure
+                may_run = left is not None and left.confirmed is False
+                state = "ended" if left is None else left.may_run if may_run else left.text
+                level = logging.INFO if failure is None and not may_run else logging.ERROR
+                log.log(level, "%s: %s", state, self.report.ended)
+                failure = self._close() or failure
+        if may_run:
+            raise MotorMayRunError(f"{state}; ended: {self.report.ended}") from failure
         if failure is not None:
             raise failure
         return self.report
@@ -338,21 +339,27 @@ class DriveLoop:
             self.report.ended = f"{counted(max_frames, 'frame')}, as asked"
         return bool(self.report.ended)
 
-    def _close(self) -> None:
-        try:
-            self._parts.source.close()
-        finally:
-            recorder = self._parts.recorder
-            if recorder is not None:
-                recorder.close()
-                self.report.recorded = recorder.recorded
-                self.report.recording = recorder.path if recorder.recorded else None
-                self.report.unrecorded = recorder.dropped
+    def _close(self) -> Exception | None:
+        """Close camera and recording; returns what failed."""
+        failure = None
+        recorder = self._parts.recorder
+        for close in (self._parts.source.close, *(() if recorder is None else (recorder.close,))):
+            try:
+                close()
+            except Exception as error:
+                failure = failure or error
+        if recorder is not None:
+            self.report.recorded = recorder.recorded
+            self.report.recording = recorder.path if recorder.recorded else None
+            self.report.unrecorded = recorder.dropped
+        return failure
 
 
 @contextmanager
 def ending_signals(stop: Callable[[str], None]) -> Iterator[None]:
-    """Call ``stop`` with the signal's name instead of dying; a second signal raises KeyboardInterrupt.
+    """Call ``stop`` with the signal's name instead of dying; a second Ctrl-C raises KeyboardInterrupt.
+
+    Other signals may come twice, from whoever ends a service, and nobody has lost patience.
 
     An ignored hang-up, as under ``nohup``, stays ignored. Does nothing outside the main thread, where Python
     allows no handlers.
@@ -364,10 +371,11 @@ def ending_signals(stop: Callable[[str], None]) -> Iterator[None]:
 
     def handle(number: int, _frame: FrameType | None) -> None:
         nonlocal asked
-        if asked:
+        if not asked:
+            asked = True
+            stop(signal.Signals(number).name)
+        elif number == signal.SIGINT:
             raise KeyboardInterrupt
-        asked = True
-        stop(signal.Signals(number).name)
 
     wanted = [n for n in ENDING if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
     before: dict[signal.Signals, Any] = {number: signal.signal(number, handle) for number in wanted}

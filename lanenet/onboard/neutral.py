@@ -10,8 +10,10 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from lanenet.errors import HardwareError
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +59,7 @@ CONFIRMED, SENT = Neutral(True), Neutral(None)
 
 def settle(
     neutral: Callable[[], Neutral | None],
-    turn: Callable[[], bool] = lambda: True,
+    turn: Callable[[], bool] | None = None,
     patience_s: float | None = None,
 ) -> Neutral | None:
     """Repeat neutral until the hardware confirms it, or the time is over.
@@ -66,7 +68,8 @@ def settle(
 
     Args:
         neutral: One attempt; None if its device is not open, which ends the attempts.
-        turn: Called between attempts, every ``AGAIN_S``; while it returns False, no answer counts.
+        turn: Called after the first attempt, and then every ``AGAIN_S``; no answer counts of an attempt that
+            began before it has returned True. None for a device that nobody else drives.
         patience_s: Longest time, [s], ``PATIENCE_S`` by default; ``SENT_S`` where nothing can be read back.
 
     Returns:
@@ -90,7 +93,7 @@ def settle(
 
     patience_s = PATIENCE_S if patience_s is None else patience_s
     start_s = time.monotonic()
-    counts, ignored, told = turn(), 0, False
+    counts, ignored, told = turn is None, 0, False
     threading.Thread(target=repeat, name="neutral", daemon=True).start()
     try:
         while True:
@@ -101,16 +104,45 @@ def settle(
             passed_s = time.monotonic() - start_s
             unreadable = counts and answer is not None and answer.confirmed is None
             if passed_s >= (SENT_S if unreadable else patience_s):
-                return answer
+                return answer if counts else Neutral(False, "its owner has not ended")
             if not told and passed_s >= SENT_S and answer is not None:
                 told = True
                 log.warning("%s; trying for %g s", answer.text, patience_s)
-            if (agreed := turn()) and not counts:
-                # An attempt that had begun before may have been undone since.
-                ignored = begun
-            counts = agreed
+            if turn is not None:
+                if (agreed := turn()) and not counts:
+                    # An attempt that had begun before may have been undone since.
+                    ignored = begun
+                counts = agreed
     finally:
         over.set()
+
+
+@runtime_checkable
+class Reachable(Protocol):
+    """An actuator or a spare access to one."""
+
+    def open(self) -> None:
+        """Connect."""
+        ...
+
+    def neutral(self) -> Neutral | None:
+        """Put the motor into neutral; None if it is not open."""
+        ...
+
+
+def reach_neutral(actuator: Reachable) -> Neutral | None:
+    """Try once to bring an actuator into neutral, which is opened for it if it is not open.
+
+    Returns:
+        As of :meth:`Reachable.neutral`; None if it cannot be opened, or another process owns it.
+    """
+    left = actuator.neutral()
+    if left is None:
+        # One that is there and does not answer stays open.
+        with suppress(HardwareError):
+            actuator.open()
+        left = actuator.neutral()
+    return left
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import logging
 import os
 import signal
 import time
@@ -21,7 +22,10 @@ from typing import TYPE_CHECKING, Any
 
 from lanenet.errors import ConfigError, HardwareError, LanenetError, MotorMayRunError, printable
 from lanenet.onboard.i2c import GUARD_MODULE, describe_process, lock_owners, words_of
-from lanenet.onboard.neutral import AGAIN_S, Neutral, settle, undisturbed
+from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
+from lanenet.reading import MEBIBYTE, read_text
+
+log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from lanenet.onboard.actuators import ActuatorSettings
@@ -30,9 +34,9 @@ if TYPE_CHECKING:
 #: A guard that is asked to end is in neutral within a turn of 15 ms and gone some milliseconds later; chosen
 #: ample, since neutral is repeated meanwhile.
 _END_S = 0.5
-#: A drive whose motor is in neutral closes its camera within 3 s, and its recording; one that takes longer
-#: hangs, for example in a network.
-_CLOSE_S = 5.0
+#: A drive whose motor is in neutral closes its camera within 3 s and its recording within 10 s; one that
+#: takes longer hangs, for example in a network.
+CLOSE_S = 15.0
 #: Better priorities than the usual, [nice]; the second is what the service allows.
 _PRIORITIES = (-20, -10)
 #: Where actuators are, if no file says it: I2C buses and serial lines.
@@ -74,16 +78,19 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
         MotorMayRunError: If neutral was not confirmed.
         MissingExtraError: If its driver is not installed.
     """
-    hurry()
     told = _tell_drives(path)
-    _tell_guards(path)
+    if not any(override.startswith("actuator") for override in overrides):
+        _tell_guards(path)
     try:
         with undisturbed():
             done = _stop_actuator(path, overrides)
     except LanenetError as error:
+        if isinstance(error, MotorMayRunError):
+            # Ending the drives takes longer.
+            log.critical("%s", error)
         done = _end_drives(path, told)
         if isinstance(error, ConfigError):
-            done += _end_guards()
+            done += _end_guards(error)
         if not done:
             # A name that was mistyped in a hurry.
             done = [f"{describe_process(pid)} drives" for pid in _drives()]
@@ -95,7 +102,7 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
 
 
 def hurry() -> None:
-    """Ask for a better priority, beside other work."""
+    """Ask for a better priority of this process, beside other work."""
     for priority in _PRIORITIES:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, 0, priority)
@@ -119,12 +126,13 @@ def _tell_guards(path: Path) -> None:
     """Ask the guards of the device to end: they are in neutral long before the settings are checked."""
     import yaml
 
-    # What is wrong with the file is said later.
+    # What is wrong with the file, or cannot be ended, is said later.
     with contextlib.suppress(Exception):
-        ours = _device_of(yaml.safe_load(path.read_text(encoding="utf-8"))["actuator"])
+        ours = _device_of(yaml.safe_load(read_text(path, ConfigError, MEBIBYTE))["actuator"])
         for pid, words in _guards():
-            if _device_of(json.loads(words[words.index(GUARD_MODULE) + 3])) == ours:
-                _tell(pid, signal.SIGTERM)
+            with contextlib.suppress(Exception):
+                if _device_of(json.loads(words[words.index(GUARD_MODULE) + 3])) == ours:
+                    _tell(pid, signal.SIGTERM)
 
 
 def _device_of(actuator: dict[str, Any]) -> tuple[Any, ...]:
@@ -187,6 +195,7 @@ def _ask_board(board: SerialBoard, owner: Callable[[], int]) -> Neutral | None:
     except HardwareError as error:
         return Neutral(False, str(error))
     finally:
+        # Others may need the line meanwhile: a drive that takes over from its guard.
         board.close()
 
 
@@ -209,11 +218,13 @@ class _Ending:
 
     Attributes:
         ended: Descriptions of those that are gone.
+        forced: Whether one of them had to be killed.
     """
 
-    def __init__(self, owner: Callable[[], int]) -> None:
+    def __init__(self, owner: Callable[[], int], patience_s: float = _END_S) -> None:
         self.ended: list[str] = []
-        self._owner = owner
+        self.forced = False
+        self._owner, self._patience_s = owner, patience_s
         self._pid, self._text, self._since_s = 0, "", 0.0
         self._signals = [signal.SIGKILL, signal.SIGTERM]
 
@@ -221,7 +232,7 @@ class _Ending:
         """Take one step; returns whether nobody owns the device any more.
 
         Raises:
-            HardwareError: If the owner cannot be ended.
+            MotorMayRunError: If the owner cannot be ended.
         """
         pid, now_s = self._owner(), time.monotonic()
         if pid != self._pid:
@@ -232,12 +243,13 @@ class _Ending:
         if not pid:
             return True
         if pid < 0:
-            raise HardwareError(
+            raise MotorMayRunError(
                 f"{self._text} still drives, which cannot be seen from here; disconnect the battery"
             )
-        if now_s - self._since_s > _END_S:
+        if self._since_s < 0.0 or now_s - self._since_s > self._patience_s:
             if not self._signals:
-                raise HardwareError(f"{self._text} cannot be ended; disconnect the battery")
+                raise MotorMayRunError(f"{self._text} cannot be ended; disconnect the battery")
+            self.forced = len(self._signals) == 1
             _tell(pid, self._signals.pop())
             self._since_s = now_s
         return False
@@ -251,7 +263,7 @@ def _tell(pid: int, number: signal.Signals) -> None:
             os.kill(pid, signal.SIGCONT)
         except PermissionError:
             text = describe_process(pid)
-            raise HardwareError(f"{text} of another user still drives; end it with sudo") from None
+            raise MotorMayRunError(f"{text} of another user still drives; end it with sudo") from None
 
 
 def _drives_of(path: Path) -> set[int]:
@@ -274,23 +286,32 @@ def _end_drives(path: Path, told: dict[int, str]) -> list[str]:
         A sentence each.
     """
     drives = told | {pid: describe_process(pid) for pid in _drives_of(path) - told.keys()}
-    for pid in sorted(drives):
-        _tell(pid, signal.SIGTERM)
-    left, end_s = set(drives), time.monotonic() + _CLOSE_S
-    while left and time.monotonic() < end_s:
-        left = {pid for pid in left if _runs(pid)}
+    done = {pid: f"ended {text}" for pid, text in sorted(drives.items())}
+
+    def tell(pid: int, number: signal.Signals) -> None:
+        try:
+            _tell(pid, number)
+        except HardwareError as error:
+            done[pid] = str(error)
+
+    for pid in drives.keys() - told.keys():
+        tell(pid, signal.SIGTERM)
+    left, end_s = set(drives), time.monotonic() + CLOSE_S
+    while (left := {pid for pid in left if _runs(pid, drives[pid])}) and time.monotonic() < end_s:
         time.sleep(AGAIN_S)
     for pid in left:
-        _tell(pid, signal.SIGKILL)
-    return [f"{'killed' if pid in left else 'ended'} {text}" for pid, text in sorted(drives.items())]
+        done[pid] = f"killed {drives[pid]}"
+        tell(pid, signal.SIGKILL)
+    return list(done.values())
 
 
-def _runs(pid: int) -> bool:
-    """Tell whether a process is there and not just waiting for its parent to notice its end."""
+def _runs(pid: int, text: str) -> bool:
+    """Tell whether a described process is there, and not just waiting for its parent to notice its end."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(") ")[2][:1] not in "ZX"
+        state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(") ")[2][:1]
     except OSError:
         return False
+    return state not in "ZX" and describe_process(pid) == text
 
 
 def _drives() -> dict[int, list[Path]]:
@@ -310,18 +331,25 @@ def _drives() -> dict[int, list[Path]]:
     return drives
 
 
-def _end_guards() -> list[str]:
-    """End the guards of all actuators, which go to neutral themselves; returns a sentence each."""
+def _end_guards(error: LanenetError) -> list[str]:
+    """End the guards of all actuators, which go to neutral themselves; returns a sentence each.
+
+    Raises:
+        MotorMayRunError: If one had to be killed: nobody knows how to go on for it. ``error`` is why.
+    """
     done = []
     for device in sorted(path for name in _NAMES for path in _DEVICES.glob(name)):
         for pid in _guards_of(device):
-            ending = _Ending(partial(_owner_if, device, pid))
+            ending = _Ending(partial(_owner_if, device, pid), PATIENCE_S + 1.0)
             try:
                 while not ending.turn():
                     time.sleep(AGAIN_S)
                 done += [f"ended {text}, which had {device}" for text in ending.ended]
-            except HardwareError as error:
-                done.append(str(error))
+            except HardwareError as problem:
+                done.append(str(problem))
+            if ending.forced:
+                why = Neutral(False, f"its guard was killed, which had {device}")
+                raise MotorMayRunError(f"{why.may_run}; {error}; {'; '.join(done)}") from None
     return done
 
 
@@ -372,10 +400,7 @@ def _first_neutral(settings: ActuatorSettings) -> Neutral | None:
     if not isinstance(actuator, PCA9685):
         return None
     with undisturbed():
-        # A chip that does not answer yet stays attached.
-        with contextlib.suppress(HardwareError):
-            actuator.open()
-        left = settle(actuator.neutral)
+        left = settle(partial(reach_neutral, actuator))
     if left is None or left.confirmed is not False:
         actuator.close()
     return left
@@ -383,6 +408,7 @@ def _first_neutral(settings: ActuatorSettings) -> Neutral | None:
 
 def main(words: Sequence[str]) -> int:
     """Run ``lanenet stop`` without the command line's other verbs; returns the exit code."""
+    hurry()
     try:
         lines = stop_car(Path(words[0]), words[1:])
     except LanenetError as error:

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from lanenet.cli.app import app
 from lanenet.errors import MotorMayRunError
 from lanenet.onboard.neutral import PATIENCE_S
+from lanenet.onboard.stop import CLOSE_S
 
 ROOT = Path(__file__).resolve().parents[2]
 UNIT = ROOT / "contrib" / "lanenet.service"
@@ -180,7 +181,7 @@ def test_a_neutral_that_is_not_confirmed_ends_with_its_code_and_no_new_drive(in_
 
 
 def test_the_time_to_stop_is_longer_than_the_patience_and_the_code_is_known(service):
-    assert float(service["TimeoutStopSec"]) > PATIENCE_S + 2.0
+    assert float(service["TimeoutStopSec"]) > PATIENCE_S + CLOSE_S
     assert int(service["RestartPreventExitStatus"]) == MotorMayRunError.exit_code
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -40,6 +41,8 @@ NORMAL_S = {"guard stopped": 0.08}
 SHORT_S = (0.02, 0.04, 0.08, 0.12, 0.3, 1.0)
 LONG_S = (6.0, 30.0, math.inf)
 MANNERS = ("fails", "hangs")
+#: A line that says that the motor is in neutral.
+_CLAIM = re.compile(r"(lanenet guard: )?neutral\b(?! (sent|not))")
 #: The wire is watched this long after neutral, for a motor that starts again.
 WATCHED_S = 0.4
 
@@ -79,14 +82,16 @@ class Result:
     wrong: str
 
 
+def environment_of(folder: Path) -> dict[str, str]:
+    """Return the environment of processes that find the emulated bus of a folder."""
+    path = os.pathsep.join([str(BUS), os.environ.get("PYTHONPATH", "")])
+    return {**os.environ, "LANENET_TEST_BUS": str(folder), "PYTHONPATH": path}
+
+
 def run(case: Case, folder: Path) -> Result:
     """Drive into an outage, in a new folder."""
     folder.mkdir(parents=True)
-    environment = {
-        **os.environ,
-        "LANENET_TEST_BUS": str(folder),
-        "PYTHONPATH": os.pathsep.join([str(BUS), os.environ.get("PYTHONPATH", "")]),
-    }
+    environment = environment_of(folder)
     wire, log = Wire(folder), folder / "log"
     car = folder / "car.yaml"
     car.write_text("actuator: {kind: pca9685}\n")
@@ -105,14 +110,18 @@ def run(case: Case, folder: Path) -> Result:
         after_s = max(begin_s + case.outage_s, begin_s + NORMAL_S.get(case.fault, 0.0))
         patience_s = min(max(case.outage_s, 0.0), PATIENCE_S + 1.0) + 1.5
         end_s = begin_s + patience_s
+        early = ""
         while time.monotonic() < end_s and (wire.motor()[-1][1] or time.monotonic() < after_s):
+            if not early and time.monotonic() < begin_s + case.outage_s:
+                early = _claim(log, wire, begin_s)
             time.sleep(0.01)
         time.sleep(WATCHED_S)
         stopped_s, runs = wire.motor()[-1]
         drives_on = case.fault == "drives on" and process.poll() is None and runs
         last = ended if ended is not None else process
         code = None if drives_on else _code(last, 3.0)
-        return _judge(case, drives_on, math.inf if runs else stopped_s - after_s, code, log)
+        late_s = math.inf if runs else stopped_s - after_s
+        return _judge(case, drives_on, late_s, code, log, early or _claim(log, wire, begin_s))
     finally:
         for pid in (process.pid, guard):
             if pid:
@@ -145,9 +154,16 @@ def _strike(
         return subprocess.Popen(words, env=environment, stdout=stream, stderr=stream)
 
 
-def _judge(case: Case, drives_on: bool, late_s: float, code: int | None, log: Path) -> Result:
+def _claim(log: Path, wire: Wire, since_s: float) -> str:
+    """Return the line that says neutral, without an addition, while the motor runs; empty if none does."""
+    lines = [line for line in log.read_text(errors="replace").splitlines() if _CLAIM.match(line)]
+    runs = wire.motor()[-1][1] or not [w for w in wire.throttles(driving=False) if w.t_s >= since_s]
+    return lines[0] if lines and runs else ""
+
+
+def _judge(case: Case, drives_on: bool, late_s: float, code: int | None, log: Path, claim: str) -> Result:
     said = log.read_text(errors="replace")
-    wrong = []
+    wrong = [f"it says {claim!r}"] if claim else []
     if drives_on:
         # A command that hangs for a moment is no fault: the guard counts it as one after 0.25 s.
         if case.outage_s > (2.0 / RATE_HZ if case.manner == "fails" else 0.25):
@@ -166,9 +182,6 @@ def _judge(case: Case, drives_on: bool, late_s: float, code: int | None, log: Pa
             wrong.append("nobody said to disconnect the battery")
         if case.fault != "loop killed" and code != MotorMayRunError.exit_code:
             wrong.append(f"code {code}, expected {MotorMayRunError.exit_code}")
-        claims = [line for line in said.splitlines() if "neutral:" in line and "not confirmed" not in line]
-        if claims:
-            wrong.append(f"it says {claims[0]!r}")
     return Result(late_s, code, said, "; ".join(wrong))
 
 
@@ -246,8 +259,7 @@ def rate_changes() -> list[tuple[float, float]]:
 
 def _change_rate(rate_hz: float, folder: Path) -> float:
     folder.mkdir()
-    path = os.pathsep.join([str(BUS), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "LANENET_TEST_BUS": str(folder), "PYTHONPATH": path}
+    environment = environment_of(folder)
     wire = Wire(folder)
     process = sender('{"kind": "pca9685"}', folder / "log", environment)()
     try:
@@ -284,8 +296,7 @@ def stop_under_load(count: int, load: int = 8) -> list[float]:
 
 def _stop(folder: Path, moment: float) -> float:
     folder.mkdir()
-    path = os.pathsep.join([str(BUS), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "LANENET_TEST_BUS": str(folder), "PYTHONPATH": path}
+    environment = environment_of(folder)
     car = folder / "car.yaml"
     car.write_text("actuator: {kind: pca9685}\n")
     wire = Wire(folder)

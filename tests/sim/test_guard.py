@@ -60,6 +60,18 @@ def test_where_nothing_can_be_read_neutral_is_repeated_for_half_a_second(wire: P
     assert len(neutral) > 10 and 0.4 <= neutral[-1] - neutral[0] <= 0.5 + LATE_S
 
 
+@pytest.mark.slow
+def test_an_idle_car_whose_neutral_is_not_confirmed_is_told(wire: Path) -> None:
+    sink = guarded(wire, doubtful=True)
+    sink.open()
+    with pytest.raises(HardwareError, match="does not confirm neutral: no answer"):
+        for _ in range(150):
+            sink.idle()
+            time.sleep(0.02)
+    left = sink.close()
+    assert left is not None and left.confirmed is False and left.why == "no answer"
+
+
 def test_neutral_first_commands_then_neutral_at_the_end(wire: Path) -> None:
     sink = guarded(wire)
     sink.open()

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from outages import FAULTS, MANNERS, Case, Result, rate_changes, run, stop_under_load
+from bus_wire import Wire
+from outages import FAULTS, MANNERS, Case, Result, environment_of, rate_changes, run, stop_under_load
 
 #: The system may wake a process late, and a busy test machine does: one of so many has to keep the time.
 TRIES = 3
@@ -41,6 +45,28 @@ def test_outages_short_and_long(fault: str, outage_s: float, manner: str, tmp_pa
 def test_a_bus_that_stays_away_is_said_and_has_a_code(fault: str, manner: str, tmp_path: Path) -> None:
     result = run(Case(fault, math.inf, manner), tmp_path / "bus")
     assert not result.wrong, f"{result.wrong}\n{result.said}"
+
+
+def test_a_drive_that_closes_slowly_is_still_stopped_on_purpose(tmp_path: Path) -> None:
+    # A second signal, of whoever stops it, is no impatience.
+    (tmp_path / "car.yaml").write_text("actuator: {kind: pca9685}\n")
+    code = (
+        "import sys, time, neutral_times; neutral_times.Camera.close = lambda _: time.sleep(1.5); "
+        'sys.exit(neutral_times.main(\'{"kind": "pca9685"}\'))'
+    )
+    environment = environment_of(tmp_path)
+    environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
+    words = [sys.executable, "-c", code, "lanenet", "drive", str(tmp_path / "car.yaml")]
+    drive = subprocess.Popen(words, env=environment, stderr=subprocess.PIPE)
+    try:
+        Wire(tmp_path).wait(driving=True, after_s=0.0)
+        stop = [sys.executable, "-m", "lanenet", "stop", str(tmp_path / "car.yaml")]
+        done = subprocess.run(stop, env=environment, capture_output=True, text=True, check=True, timeout=30)
+        assert done.stdout.splitlines()[0] == "neutral" and f"ended process {drive.pid}" in done.stdout
+        assert drive.wait(5.0) == 0
+    finally:
+        drive.kill()
+        drive.communicate()
 
 
 def test_another_rate_of_the_chip_is_noticed_and_mended() -> None:

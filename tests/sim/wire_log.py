@@ -26,6 +26,9 @@ class WireLog:
         settings = json.loads(settings_json)
         self._path = settings["path"]
         self._fail_at, self._hang_at = settings.get("fail_at"), settings.get("hang_at")
+        self._is_open = False
+        #: Whether neutral is not confirmed.
+        self._doubtful = settings.get("doubtful", False)
         #: Whether neutral can be read back.
         self._readable = settings.get("readable", True)
         self._refuse, self._unplugged = settings.get("refuse", ""), settings.get("unplugged", False)
@@ -38,6 +41,7 @@ class WireLog:
         if self._refuse:
             raise HardwareError(self._refuse)
         self._write("open")
+        self._is_open = True
 
     def send(self, steering_rad: float, throttle: float) -> None:
         self._sent += 1
@@ -49,8 +53,12 @@ class WireLog:
             time.sleep(3600.0)
         self._write("send", steering_rad, throttle)
 
-    def neutral(self) -> Neutral:
+    def neutral(self) -> Neutral | None:
+        if not self._is_open:
+            return None
         self._write("neutral")
+        if self._doubtful and self._sent == 0:
+            return Neutral(False, "no answer")
         return CONFIRMED if self._readable else SENT
 
     def close(self) -> None:

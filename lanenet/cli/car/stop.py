@@ -19,6 +19,7 @@ def stop(
     overrides: OverridesArgument = None,
 ) -> None:
     """Put the motor into neutral and end the drive, within a fraction of a second."""
-    from lanenet.onboard.stop import stop_car
+    from lanenet.onboard.stop import hurry, stop_car
 
+    hurry()
     console.show_lines(stop_car(config, overrides or ()))

@@ -8,6 +8,7 @@ Source: NXP PCA9685 data sheet, revision 4: registers in 7.3, prescaler in 7.3.5
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
 from collections.abc import Sequence
@@ -25,8 +26,8 @@ from lanenet.onboard.neutral import CONFIRMED, Neutral
 
 MODE1, MODE2, LED0_ON_L, PRE_SCALE = 0x00, 0x01, 0x06, 0xFE
 RESTART, EXTCLK, AUTO_INCREMENT, SLEEP = 0x80, 0x40, 0x20, 0x10
-#: MODE2: outputs drive high and low, as servos need, and are not inverted.
-INVRT, OUTDRV = 0x10, 0x04
+#: MODE2: outputs drive high and low, as servos need; not inverted, and low while OE is high.
+OUTDRV, _MODE2_USED = 0x04, 0x1F
 OSCILLATOR_HZ = 25e6
 COUNTS = 4096
 #: After every write of the start; the oscillator needs 0.5 ms to start after sleep.
@@ -173,7 +174,7 @@ class PCA9685:
                 self._start(self._chip)
                 wrong = self._differences(self._chip)
             except OSError as error:
-                wrong = f"no PCA9685 answers ({error.strerror or error})"
+                wrong = self._silence(error)
             if not wrong and self._settings.heartbeat is not None:
                 self._heartbeat = Heartbeat(self._settings.heartbeat)
                 self._heartbeat.open()
@@ -182,8 +183,7 @@ class PCA9685:
             raise
         if wrong:
             raise HardwareError(
-                f"{name}: {wrong}; look for it with i2cdetect -y {self._settings.bus}; is the chip there a "
-                "PCA9685, and does another program use it?"
+                f"{name}: {wrong}; is the chip there a PCA9685, and does another program use it?"
             )
 
     def attach(self) -> None:
@@ -259,7 +259,7 @@ class PCA9685:
                     self._start(chip)
                     wrong = self._differences(chip)
             except Exception as error:
-                wrong = f"no PCA9685 answers ({getattr(error, 'strerror', None) or error})"
+                wrong = self._silence(error)
         if wrong:
             return Neutral(False, f"{chip.name}: {wrong}")
         # Else a watchdog of hardware has to switch the outputs off.
@@ -279,6 +279,13 @@ class PCA9685:
             heartbeat.close()
         if chip is not None:
             chip.close()
+
+    def _silence(self, error: Exception) -> str:
+        reason = getattr(error, "strerror", None) or error
+        return (
+            f"no PCA9685 answers ({reason}); check its cable and supply, and look for it with i2cdetect -y "
+            f"{self._settings.bus}"
+        )
 
     def _beat(self) -> None:
         if self._heartbeat is not None:
@@ -312,7 +319,7 @@ class PCA9685:
             return "the chip sleeps, as after a restart, and sends no pulses"
         registers = (
             ("MODE1", mode1 & (EXTCLK | AUTO_INCREMENT), AUTO_INCREMENT),
-            ("MODE2", mode2 & (INVRT | OUTDRV), OUTDRV),
+            ("MODE2", mode2 & _MODE2_USED, OUTDRV),
             ("PRE_SCALE", prescale, prescale_of(self._settings.frequency_hz)),
         )
         wrong = [
@@ -324,6 +331,7 @@ class PCA9685:
             output = allowed[0][0]
             data = chip.read(output, 4)
             if all(data != write[1:] for write in allowed):
-                counts = int.from_bytes(data[2:], "little")
-                wrong.append(f"channel {(output - LED0_ON_L) // 4} holds {counts} counts")
+                on, off = struct.unpack("<HH", data)
+                high = f"{off} counts" if not on else f"{off} counts from {on} on"
+                wrong.append(f"channel {(output - LED0_ON_L) // 4} holds {high}")
         return " and ".join(wrong)

@@ -367,6 +367,9 @@ class SerialBoard:
                     time.sleep(0.1 * REPORT_S)
                     self._receive()
             except Exception as error:
+                if locked:
+                    # A plug that slipped: the port is another one when it is back.
+                    self._release()
                 return Neutral(False, f"{self._settings.port}: {error}")
         if self._is_neutral():
             return CONFIRMED

@@ -231,11 +231,18 @@ def _actuator(settings: DriveSettings) -> Check:
     name = f"actuator {settings.actuator.kind}"
     try:
         actuator = make_actuator(settings.actuator)
+    except LanenetError as error:
+        return Check(name, "problem", str(error))
+    try:
         actuator.open()
     except LanenetError as error:
         return Check(name, "problem", str(error))
-    actuator.close()
-    return Check(name, "ok", "answers, and is in neutral")
+    finally:
+        left = actuator.neutral()
+        actuator.close()
+    if left is None or left.confirmed is False:
+        return Check(name, "problem", "no answer" if left is None else left.may_run)
+    return Check(name, "ok", f"answers: {left.text}")
 
 
 def _vcgencmd() -> str:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from lanenet import __main__
 from lanenet.cli.app import app
 from lanenet.errors import ConfigError, HardwareError, LanenetError, MotorMayRunError
 from lanenet.onboard import neutral, stop
+from lanenet.onboard.actuators.pca9685 import PCA9685
 from lanenet.onboard.i2c import GUARD_MODULE, lock_owners
 
 #: A drive that still starts, as far as others see.
@@ -69,7 +71,7 @@ def test_a_chip_that_nobody_drives_any_more(bus, car):
     assert stop.stop_car(car) == ["neutral", "nothing of lanenet was driving"]
     assert bus.chip.counts(0) == 370 and not bus.chip.asleep and bus.closed
     # The motor first, and without a moment of sleep in which there are no pulses.
-    assert [data[0] for data in bus.wire if len(data) > 1] == [0x06, 0x0A]
+    assert [data[0] for data in bus.wire if len(data) > 1] == [0x06, 0x0A] * 2
 
 
 def test_a_chip_that_sleeps_is_started_in_neutral(bus, car):
@@ -225,8 +227,26 @@ def test_a_chip_that_comes_back_is_waited_for(bus, car):
     back.join()
 
 
+def test_a_bus_that_hangs_does_not_hold_up_the_start_of_a_drive(bus, car, impatient):
+    over = threading.Event()
+    bus.before_transfer = lambda _: over.wait(20.0)
+    begun_s = time.monotonic()
+    with pytest.raises(MotorMayRunError, match="disconnect the battery"):
+        stop.prepare_drive(["--arm", str(car)])
+    assert time.monotonic() - begun_s < 5.0
+    over.set()
+
+
+def test_a_chip_that_somebody_else_drives_is_sent_neutral_although_its_owner_stays(bus, car, monkeypatch):
+    drive(bus)
+    monkeypatch.setattr(PCA9685, "owner", lambda _: -1)
+    with pytest.raises(MotorMayRunError, match="cannot be seen from here; disconnect the battery"):
+        stop.stop_car(car)
+    assert bus.chip.counts(0) == 370
+
+
 def test_a_drive_that_is_deaf_is_killed(bus, car, monkeypatch):
-    monkeypatch.setattr(stop, "_CLOSE_S", 0.3)
+    monkeypatch.setattr(stop, "CLOSE_S", 0.3)
     code = STARTING.replace("print", "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print")
     words = [sys.executable, "-ISc", code, "lanenet", "drive", car]
     deaf = subprocess.Popen(words, stdout=subprocess.PIPE)
