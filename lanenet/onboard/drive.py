@@ -26,6 +26,7 @@ from lanenet.onboard.arming import ArmCheck, ArmGate, HoldFile
 from lanenet.onboard.cameras import SourceSettings, open_source
 from lanenet.onboard.cameras.live import CameraSettings
 from lanenet.onboard.cameras.replay import ReplaySettings
+from lanenet.onboard.car_file import with_full_paths
 from lanenet.onboard.devices import Frame
 from lanenet.onboard.guard import CommandSink, GuardedActuator, NoActuator
 from lanenet.onboard.loop import CarParts, DriveLoop, DriveMode, Step
@@ -96,13 +97,14 @@ class DriveSettings(Settings):
 
 
 def load_drive_settings(path: Path, overrides: list[str] | None = None) -> DriveSettings:
-    """Read a car's settings; the wheelbase defaults to the camera file's.
+    """Read a car's settings, whose paths count from the file; the wheelbase defaults to the camera file's.
 
     Raises:
         ConfigError: Naming the file, the key, what was found and what was expected.
         CalibrationError: If the camera file is needed and cannot be used.
     """
-    data = apply_overrides(read_yaml(path), overrides or [])
+    # A path in an override counts from the working folder, as every other one on a command line.
+    data = apply_overrides(with_full_paths(read_yaml(path), path), overrides or [])
     return check_settings(DriveSettings, _with_wheelbase(data), str(path))
 
 

@@ -3,7 +3,9 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -11,12 +13,16 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from lanenet.cli.app import app
+from lanenet.config import _models_in
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import CalibrationError, ConfigError
+from lanenet.onboard.actuators import PCA9685Settings
 from lanenet.onboard.arming import HoldFile
 from lanenet.onboard.bench import LANE_WIDTH_CM, example_camera, example_frames
-from lanenet.onboard.drive import build_loop, load_drive_settings
+from lanenet.onboard.cameras.replay import ReplaySettings
+from lanenet.onboard.car_file import PATHS, with_full_paths
+from lanenet.onboard.drive import DriveSettings, build_loop, load_drive_settings
 from lanenet.onboard.safety import State
 
 
@@ -52,6 +58,51 @@ def test_the_wheelbase_is_the_cameras_unless_the_settings_say(car: Path) -> None
         load_drive_settings(car, ["camera=null"])
     with pytest.raises(CalibrationError, match=r"nowhere\.yaml"):
         load_drive_settings(car, ["camera=nowhere.yaml"])
+
+
+def path_fields(schema: Any, prefix: str = "") -> Iterator[tuple[str, str | None]]:
+    """Keys of a schema that hold a path, with their defaults."""
+    for name, field in schema.model_fields.items():
+        if Path in (field.annotation, *get_args(field.annotation)):
+            yield f"{prefix}{name}", None if field.is_required() or not field.default else str(field.default)
+        for nested in _models_in(field.annotation):
+            yield from path_fields(nested, f"{prefix}{name}.")
+
+
+def test_every_path_of_a_car_counts_from_its_file() -> None:
+    assert dict(path_fields(DriveSettings)) == PATHS
+
+
+def test_paths_count_from_the_file_and_those_of_overrides_from_here(
+    car: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = yaml.safe_load(car.read_text())
+    config["source"]["path"], config["camera"] = "drive", "./drive/../drive/camera.yaml"
+    config["detector"]["mask"], config["recording"] = "/of/all.png", {}
+    config["actuator"] = {"kind": "pca9685", "myconfig": "mycar/myconfig.py"}
+    car.write_text(yaml.safe_dump(config))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    for name in (car, Path("..") / car.name):
+        settings = load_drive_settings(name)
+        assert isinstance(settings.source, ReplaySettings) and settings.source.path == tmp_path / "drive"
+        assert settings.camera == tmp_path / "drive" / "camera.yaml"
+        assert settings.detector.mask == Path("/of/all.png")
+        assert isinstance(settings.actuator, PCA9685Settings)
+        assert settings.actuator.myconfig == tmp_path / "mycar" / "myconfig.py"
+        assert settings.recording is not None and settings.recording.folder == tmp_path / "drives"
+    given = load_drive_settings(car, ["source.path=tub", "recording.folder=kept"])
+    assert isinstance(given.source, ReplaySettings) and given.source.path == Path("tub")
+    assert given.recording is not None and given.recording.folder == Path("kept")
+    # What is of a wrong type is refused by its key, as before.
+    with pytest.raises(ConfigError, match="key 'camera'"):
+        car.write_text(yaml.safe_dump({**config, "camera": 3}))
+        load_drive_settings(car)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert with_full_paths({"camera": "~/camera.yaml"}, car)["camera"] == str(tmp_path / "camera.yaml")
+    assert with_full_paths({"detector": {"model": "hf:a/b"}}, car)["detector"]["model"] == "hf:a/b"
+    assert with_full_paths({"source": [1], "actuator": None}, car) == {"source": [1], "actuator": None}
 
 
 @pytest.mark.parametrize("words", [("--hold", "key"), ("--arm", "--hold-fresh", "1")])
