@@ -46,6 +46,14 @@ def bus(monkeypatch):
     return bus
 
 
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch):
+    """Which priorities were asked for; the tests keep theirs."""
+    asked = []
+    monkeypatch.setattr(os, "setpriority", lambda *words: asked.append(words[-1]))
+    return asked
+
+
 @pytest.fixture
 def car(tmp_path):
     # Only the actuator counts: whoever needs to stop a car does not want to hear of its camera file.
@@ -304,14 +312,14 @@ def test_the_program_prepares_a_drive_before_it_imports_the_command_line(bus, ca
     assert lock_owners(car.stat()) == [os.getpid()]
 
 
-def test_the_program_stops_a_car_without_the_command_line(bus, car, monkeypatch):
+def test_the_program_stops_a_car_without_the_command_line(bus, car, monkeypatch, hurried):
     monkeypatch.setitem(sys.modules, "lanenet.cli.app", None)
     monkeypatch.setattr(sys, "path", list(sys.path))
     drive(bus)
     monkeypatch.setattr(sys, "argv", ["lanenet", "stop", str(car)])
     with pytest.raises(SystemExit) as ended:
         __main__.main()
-    assert ended.value.code == 0 and bus.chip.counts(0) == 370
+    assert ended.value.code == 0 and bus.chip.counts(0) == 370 and hurried == [-20]
 
 
 def test_drive_is_neutral_before_it_has_imported_the_rest(bus, car):
