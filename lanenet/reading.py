@@ -19,6 +19,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lanenet.errors import LanenetError
+from lanenet.image_header import as_stored, image_size, is_cut_off, orientation
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,6 +33,12 @@ MAX_JSON = 32 * MEBIBYTE
 MAX_IMAGE = 64 * MEBIBYTE
 #: Of an image. Chosen: above the 50 megapixels of a phone; 192 MB decoded.
 MAX_PIXELS = 64 * 10**6
+
+#: What each orientation of Exif takes: exchange rows and columns, then top and bottom, then left and right.
+_TURNS = {
+    **{1: (False, False, False), 2: (False, False, True), 3: (False, True, True), 4: (False, True, False)},
+    **{5: (True, False, False), 6: (True, False, True), 7: (True, True, True), 8: (True, True, False)},
+}
 
 #: What parsers of Python, NumPy and PyYAML raise for bytes that they were not made for.
 _PARSER_ERRORS = (
@@ -205,24 +212,29 @@ class FolderFiles:
 
 
 def read_image(
-    path: Path, error: type[LanenetError], flags: int | None = None
+    path: Path, error: type[LanenetError], flags: int | None = None, turn: int | None = None
 ) -> UInt8[np.ndarray, "h w *c"]:
-    """Read an image file of a usual format.
+    """Read an image file of a usual format, as it is shown: turned as its Exif data say.
 
     Args:
         path: JPEG, PNG, BMP, WebP, TIFF or Netpbm, by its content.
         error: The error to raise.
         flags: OpenCV's; None is colour, BGR.
+        turn: How to turn it, as Exif's orientation; None takes the image's own.
 
     Raises:
         LanenetError: Of the type ``error``, if the file is missing, is no image, is too large, or ends too
             early: OpenCV fills the rest of a truncated JPEG with gray without an error.
     """
-    return decode_image(read_bytes(path, error, MAX_IMAGE), path, error, flags)
+    return decode_image(read_bytes(path, error, MAX_IMAGE), path, error, flags, turn)
 
 
 def decode_image(
-    data: bytes, where: object, error: type[LanenetError], flags: int | None = None
+    data: bytes,
+    where: object,
+    error: type[LanenetError],
+    flags: int | None = None,
+    turn: int | None = None,
 ) -> UInt8[np.ndarray, "h w *c"]:
     """Decode the bytes of an image file; arguments and errors as for :func:`read_image`."""
     # Not at the top: settings are read where OpenCV would only cost time.
@@ -237,116 +249,18 @@ def decode_image(
             f"{where}: image of {size[0]}x{size[1]} px, expected at most {MAX_PIXELS // 10**6} megapixels"
         )
     image = None
-    if size is not None and not _truncated(data):
+    if size is not None and not is_cut_off(data):
+        flags = (cv2.IMREAD_COLOR if flags is None else flags) | cv2.IMREAD_IGNORE_ORIENTATION
         try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR if flags is None else flags)
+            # IMREAD_UNCHANGED is -1, which holds all flags.
+            image = cv2.imdecode(np.frombuffer(as_stored(data), np.uint8), flags)
         except cv2.error:
             image = None
     if image is None:
         raise error(f"{where}: not a readable image (corrupt or cut off, {len(data)} bytes)")
-    return np.asarray(image)
-
-
-def image_size(data: bytes) -> tuple[int, int] | None:
-    """Read width and height from an image's header; None if the format is unknown or the header damaged.
-
-    Formats: JPEG (ITU-T T.81, B.2.2), PNG, BMP, WebP (RFC 9649), TIFF 6.0, Netpbm. OpenCV reads others, too,
-    but no camera writes them.
-    """
-    try:
-        for start, read in _SIZE_READERS:
-            if data.startswith(start):
-                size = read(data)
-                return size if size is not None and min(size) > 0 else None
-    except (struct.error, ValueError, IndexError, KeyError):
-        pass
-    return None
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    # Chosen: far more segments than any camera writes; a file of nothing but markers would take seconds.
-    for _ in range(10_000):
-        if data[at] != 0xFF:
-            return None
-        marker = data[at + 1]
-        # Frame headers, without the tables DHT, JPG and DAC between them.
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        if marker in (0xD9, 0xDA):
-            return None
-        if marker == 0xFF:  # a filling byte
-            at += 1
-        elif 0xD0 <= marker <= 0xD7 or marker == 1:  # restart markers and TEM have no length
-            at += 2
-        else:
-            at += 2 + struct.unpack_from(">H", data, at + 2)[0]
-    return None
-
-
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    width, height = struct.unpack_from(">II", data, 16)
-    return width, height
-
-
-def _bmp_size(data: bytes) -> tuple[int, int] | None:
-    if struct.unpack_from("<I", data, 14)[0] == 12:
-        width, height = struct.unpack_from("<HH", data, 18)
-    else:
-        width, height = struct.unpack_from("<ii", data, 18)
-    return abs(width), abs(height)
-
-
-def _webp_size(data: bytes) -> tuple[int, int] | None:
-    kind = data[8:16]
-    if kind == b"WEBPVP8X":
-        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    if kind == b"WEBPVP8L":
-        bits = struct.unpack_from("<I", data, 21)[0]
-        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-    if kind == b"WEBPVP8 ":
-        width, height = struct.unpack_from("<HH", data, 26)
-        return width & 0x3FFF, height & 0x3FFF
-    return None
-
-
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    order = "<" if data[:2] == b"II" else ">"
-    directory = struct.unpack_from(order + "I", data, 4)[0]
-    found: dict[int, int] = {}
-    for k in range(struct.unpack_from(order + "H", data, directory)[0]):
-        at = directory + 2 + 12 * k
-        tag, kind = struct.unpack_from(order + "HH", data, at)
-        found[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, at + 8)[0]
-    return found[256], found[257]
-
-
-def _netpbm_size(data: bytes) -> tuple[int, int] | None:
-    # A comment runs to the end of its line.
-    lines = (line.partition(b"#")[0] for line in data[2:4096].split(b"\n"))
-    words = b" ".join(lines).split()
-    return int(words[0]), int(words[1])
-
-
-_SIZE_READERS = (
-    (b"\xff\xd8", _jpeg_size),
-    (b"\x89PNG\r\n\x1a\n", _png_size),
-    (b"BM", _bmp_size),
-    (b"RIFF", _webp_size),
-    (b"II*\0", _tiff_size),
-    (b"MM\0*", _tiff_size),
-    *((b"P%d" % kind, _netpbm_size) for kind in (1, 2, 3, 4, 5, 6)),
-)
-
-
-def _truncated(data: bytes) -> bool:
-    if data.startswith(b"\xff\xd8"):
-        # The end marker must follow the last scan: a thumbnail in the header has an end marker, too.
-        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data[-64:]
-    return False
+    transposed, up_down, left_right = _TURNS[orientation(data) if turn is None else turn]
+    image = image.swapaxes(0, 1) if transposed else image
+    return np.ascontiguousarray(image[:: -1 if up_down else 1, :: -1 if left_right else 1])
 
 
 def _check_regular(path: Path, status: os.stat_result, error: type[LanenetError], most: int) -> None:

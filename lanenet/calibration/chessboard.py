@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +15,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lanenet.errors import CalibrationError, ConfigError
+from lanenet.image_header import orientation
 from lanenet.processes import in_threads
-from lanenet.reading import natural_key, read_image
+from lanenet.reading import MAX_IMAGE, natural_key, read_bytes, read_image
 
 PICTURE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 #: Fewest rows and columns of corners of a board that is cut off. Chosen: 16 corners for the six numbers of a
@@ -112,13 +115,25 @@ def list_pictures(words: Sequence[str]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read an image as BGR; the orientation in its metadata is not applied, as a camera knows none.
+def read_picture(path: Path, turn: int | None = None) -> UInt8[np.ndarray, "h w 3"]:
+    """Read an image as BGR, as it is shown, like all images; ``turn`` as for :func:`read_image`.
 
     Raises:
         CalibrationError: If it cannot be read as an image.
     """
-    return read_image(path, CalibrationError, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return read_image(path, CalibrationError, turn=turn)
+
+
+def common_turn(paths: Sequence[Path]) -> int:
+    """Return the orientation of Exif that the most images have.
+
+    Photos of one lens are turned alike, whichever way the camera was held: the lens does not turn in it.
+    """
+    turns: Counter[int] = Counter()
+    for path in paths:
+        with contextlib.suppress(CalibrationError):
+            turns[orientation(read_bytes(path, CalibrationError, MAX_IMAGE))] += 1
+    return turns.most_common(1)[0][0] if turns else 1
 
 
 def find_view(name: str, image: np.ndarray, board: Board) -> BoardView | str:
@@ -171,10 +186,11 @@ def find_views(
     """
     views: list[BoardView] = []
     left_out: dict[str, str] = {}
+    turn = common_turn(paths)
 
     def find(path: Path) -> BoardView | str:
         try:
-            return find_view(str(path), read_picture(path), board)
+            return find_view(str(path), read_picture(path, turn), board)
         except CalibrationError as error:
             return str(error).removeprefix(f"{path}: ")
 

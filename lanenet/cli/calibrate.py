@@ -76,7 +76,7 @@ def chessboard(
     ros: Annotated[Path | None, typer.Option(help="Also write a ROS camera_info file (.yaml).")] = None,
 ) -> None:
     """Find a camera's lens from photos of a chessboard held in different tilts and places."""
-    from lanenet.calibration.chessboard import find_views, list_pictures, parse_board
+    from lanenet.calibration.chessboard import common_turn, find_views, list_pictures, parse_board
     from lanenet.calibration.chessboard_camera import calibrate_lens
     from lanenet.calibration.lens import NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM
     from lanenet.data.camera_file import write_camera, write_ros_camera_info
@@ -118,7 +118,7 @@ def chessboard(
     )
     if ros is not None:
         write_ros_camera_info(ros, result.camera, out.stem)
-    pictures = _lens_pictures(out, result)
+    pictures = _lens_pictures(out, result, common_turn(paths))
     left_out = {**left_out, **result.dropped}
     _show_lens(result, len(paths))
     console.show_problems([f"left out {name}: {reason}" for name, reason in left_out.items()], limit=100)
@@ -337,7 +337,7 @@ def _board_points(
     return points_of_floor_board(view, wanted, (x_cm, y_cm))
 
 
-def _lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
+def _lens_pictures(out: Path, result: ChessboardCalibration, turn: int) -> list[Path]:
     """Write the largest view undistorted, and its board from above; returns the paths."""
     from lanenet.calibration.chessboard import read_picture
     from lanenet.calibration.chessboard_camera import reprojected
@@ -347,7 +347,7 @@ def _lens_pictures(out: Path, result: ChessboardCalibration) -> list[Path]:
     sizes = [float(np.prod(np.ptp(view.corners_px, axis=0))) for view in result.views]
     index = int(np.argmax(sizes))
     view = result.views[index]
-    frame = read_picture(Path(view.name))
+    frame = read_picture(Path(view.name), turn)
     marked = points_picture(frame, view.corners_px, reprojected(result, index))
     (x0, y0), (x1, y1) = view.points_cm.min(axis=0), view.points_cm.max(axis=0)
     margin = 0.4 * max(x1 - x0, y1 - y0)

@@ -32,9 +32,10 @@ from lanenet.errors import CalibrationError, ConfigError, LabelFormatError
 from lanenet.geometry.birdseye import BirdseyeWindow, WindowFile
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, label_rows, rows_of_polyline
+from lanenet.image_header import image_size
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdges
-from lanenet.reading import image_size, parsing
+from lanenet.reading import parsing
 
 __all__ = [
     "LabelIndex",

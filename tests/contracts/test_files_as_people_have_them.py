@@ -19,8 +19,10 @@ import pytest
 from commands import refused
 from drives import frame_image, record, write_drive, write_tub
 from mp4 import Change, change_boxes, timed, turned
+from PIL import Image
 from typer.testing import CliRunner
 
+from lanenet.calibration.chessboard import common_turn, read_picture
 from lanenet.cli.app import app
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.sources import open_source
@@ -406,6 +408,37 @@ def test_a_video_is_turned_as_it_says(tmp_path: Path, degrees: int) -> None:
 
 
 # Photos.
+
+
+def turned_photo(path: Path, image_bgr: np.ndarray, orientation: int) -> None:
+    """A photo as it is shown: stored otherwise, with the orientation that brings it back."""
+    back = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}[orientation]
+    stored = {
+        **{1: image_bgr, 2: image_bgr[:, ::-1], 3: image_bgr[::-1, ::-1], 4: image_bgr[::-1]},
+        **{5: image_bgr.swapaxes(0, 1), 6: np.rot90(image_bgr, -1), 8: np.rot90(image_bgr)},
+        7: np.rot90(image_bgr, 2).swapaxes(0, 1),
+    }[back]
+    exif = Image.Exif()
+    exif[274] = orientation
+    how = {"lossless": True} if path.suffix == ".webp" else {"quality": 98} if path.suffix == ".jpg" else {}
+    Image.fromarray(np.ascontiguousarray(stored[..., ::-1])).save(path, exif=exif, **how)
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_an_image_is_as_it_is_shown_whoever_reads_it(tmp_path: Path, ending: str, orientation: int) -> None:
+    """OpenCV's versions differ in the formats that they turn, and calibration turned none."""
+    shown = frame_image(5)
+    (tmp_path / "images").mkdir()
+    file = tmp_path / "images" / f"a.{ending}"
+    turned_photo(file, shown, orientation)
+    (tmp_path / "frames.csv").write_text(f"frame,file,t_s\n0,images/a.{ending},0\n")
+    drive = open_drive(tmp_path)
+    for image in (drive.image(0), open_source(file).image(0), read_picture(file)):
+        assert np.abs(image.astype(int) - shown).max() <= (12 if ending == "jpg" else 0)
+    # Of photos of a lens, all are turned as most of them are.
+    assert common_turn([file, file]) == orientation
+    assert read_picture(file, 1).shape == ((48, 64, 3) if orientation < 5 else (64, 48, 3))
 
 
 def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from lanenet.data.tables import png_bytes
 from lanenet.errors import DriveFormatError, LabelFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM
+from lanenet.image_header import orientation
 from lanenet.reading import MAX_IMAGE, read_bytes
 
 #: Image files that every tool reads, taken over byte for byte; others become PNG.
@@ -92,8 +93,10 @@ class Pictures:
         image, source = self.drive.image(row), self.drive.images
         if isinstance(source, ImageFiles):
             path = source.paths[int(self.drive.rows[row])]
-            if path.suffix.lower() in _KEPT_ENDINGS:
-                return read_bytes(path, DriveFormatError, MAX_IMAGE), path.suffix.lower()
+            data = read_bytes(path, DriveFormatError, MAX_IMAGE)
+            # Other tools turn an image as its Exif data say, or do not; the labels are of the turned one.
+            if path.suffix.lower() in _KEPT_ENDINGS and orientation(data) == 1:
+                return data, path.suffix.lower()
         return png_bytes(image), ".png"
 
 

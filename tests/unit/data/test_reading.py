@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from lanenet.errors import ConfigError, DriveFormatError
-from lanenet.reading import FolderFiles, image_size, parsing, read_bytes, read_image
+from lanenet.image_header import image_size
+from lanenet.reading import FolderFiles, parsing, read_bytes, read_image
 
 WIDTH, HEIGHT = 37, 21
 

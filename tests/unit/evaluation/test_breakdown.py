@@ -21,7 +21,7 @@ from lanenet.evaluation.errors import (
 from lanenet.evaluation.report import plot_breakdown
 from lanenet.evaluation.tables import as_markdown, lay_out
 from lanenet.geometry.lane import POINTS_FROM_PARABOLA
-from lanenet.reading import image_size
+from lanenet.image_header import image_size
 
 NAN = float("nan")
 TRUTH = np.zeros((200, 6))

@@ -10,7 +10,7 @@ from lanenet.errors import LabelFormatError
 from lanenet.evaluation.comparison import FORMAT, SourceAnswers, compare_detectors
 from lanenet.evaluation.report import plot_errors
 from lanenet.evaluation.tables import as_markdown, lay_out
-from lanenet.reading import image_size
+from lanenet.image_header import image_size
 
 NAN = float("nan")
 TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (5, 1))
