@@ -167,7 +167,7 @@ def calibrate_drive(
         found, settings, drive_path, needed=lane_width_cm is not None and camera_height_cm is None
     )
     factor, height_sigma, scale_from = _scale(found.camera, lane, lane_width_cm, camera_height_cm)
-    height = found.camera.mounting.height_cm
+    shown = straight_frames(found.solved.poses, _SEEN_HEIGHTS * found.camera.mounting.height_cm, _SHOWN)
     camera = with_known_scale(found.camera, factor, settings.guess.wheelbase_cm)
     lane_cm = None if lane is None else factor * lane.width_cm
     if lane_width_cm and lane_cm and abs(lane_cm / lane_width_cm - 1.0) > _OTHER_LANE:
@@ -184,7 +184,7 @@ def calibrate_drive(
         revisits=len(found.solved.revisits),
         robust_sd_px=found.solved.bundle.robust_sd_px,
         lane_cm=lane_cm,
-        shown=straight_frames(found.solved.poses, _SEEN_HEIGHTS * height, _SHOWN),
+        shown=tuple(found.solved.rows[list(shown)].tolist()),
         drive=drive,
     )
 

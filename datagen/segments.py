@@ -19,8 +19,9 @@ from datagen.prepare import LEAST_FRAMES, PreparedDrive, check_edges
 from datagen.settings import MapSettings
 from datagen.slam.camera.coarse import nudged
 from datagen.slam.camera.self_calibration import MAX_STRAIN, FoundCamera, find_camera, honest_sigma
-from datagen.slam.loops.parts import connected
+from datagen.slam.loops.parts import LEAST_TIED, connected
 from datagen.slam.segment import SegmentSolver, SolvedSegment
+from datagen.slam.view import LEAST_POINTS
 from lanenet.data.drives import Drive
 from lanenet.data.segments import equal_runs
 from lanenet.errors import CalibrationError, TrackingLostError, counted
@@ -40,6 +41,8 @@ _FOCAL_BY_K1 = 1.7
 #: Times that a drive is solved again with another focal length, and relative change below which it is not.
 #: Chosen: the slope is off by a third at most, so that two steps leave a tenth of the error.
 _HEIGHT_ROUNDS, _SAME_FOCAL = 3, 0.01
+#: Runs of frames that a note names. Chosen: a line of the terminal.
+_NAMED_RUNS = 5
 
 
 @dataclass(frozen=True)
@@ -216,14 +219,20 @@ def solve_drive(prepared: PreparedDrive, camera: CameraOfDrive, solver: SegmentS
             f"{drive.path}: {len(drive)} frames in {len(found)} parts that show no place of each other, the "
             f"longest of {len(found[0].rows)} frames; mapping needs {LEAST_FRAMES}"
         )
-    refused = [
-        Refused(
-            one.rows, TrackingLostError(f"{counted(len(one.rows), 'frame')} that show no place of others")
-        )
-        for one in found
-        if len(one.rows) < LEAST_FRAMES
-    ]
     kept = sorted((one for one in found if len(one.rows) >= LEAST_FRAMES), key=lambda one: int(one.rows[0]))
+    short = [one.rows for one in found if len(one.rows) < LEAST_FRAMES]
+    untied = np.setdiff1d(np.arange(len(drive)), np.concatenate([one.rows for one in found]))
+    refused = []
+    if short:
+        rows, parts = np.sort(np.concatenate(short)), f" in {len(short)} parts" if len(short) > 1 else ""
+        reason = f"{counted(len(rows), 'frame')}{parts} that show no place of others"
+        refused.append(Refused(rows, TrackingLostError(reason)))
+    if len(untied):
+        reason = (
+            f"nothing ties them to others: between two breaks, less than {LEAST_TIED} frames show "
+            f"{LEAST_POINTS} edge points on the road"
+        )
+        refused.append(Refused(untied, TrackingLostError(reason)))
     return SolvedDrive(tuple(kept), tuple(refused))
 
 
@@ -249,7 +258,8 @@ def fit_lanes(
             is in doubt.
     """
     drive, settings, held_out = prepared.drive, prepared.settings, prepared.held_out
-    mapped, left_out = [], list(refused)
+    mapped: list[MappedSegment] = []
+    failed: list[Refused] = []
     lane_cm, dark = prepared.known_lane_cm, None
     for segment in sorted(segments, key=lambda one: -len(one.rows)):
         rows = segment.rows
@@ -257,14 +267,14 @@ def fit_lanes(
             one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit, dark)
             check_lane(one, drive)
         except (TrackingLostError, CalibrationError) as error:
-            left_out.append(Refused(rows, error))
+            failed.append(Refused(rows, error))
         else:
             mapped.append(one)
             # A road keeps its width and its markings; the longest segment shows them best.
             dark = one.dark
             lane_cm = lane_cm or fitted_width(one.lines, one.lane, one.s_frames_cm).width_cm
     if not mapped:
-        reason = max(left_out, key=lambda one: len(one.rows)).reason
+        reason = failed[0].reason  # of the longest
         if doubt:
             why = str(reason).removeprefix(f"{drive.path}: ")
             raise CalibrationError(
@@ -274,10 +284,12 @@ def fit_lanes(
             ) from reason
         raise reason
     mapped.sort(key=lambda one: int(one.rows[0]))
-    return LanesOfDrive(tuple(mapped), tuple(one.note(drive) for one in left_out))
+    return LanesOfDrive(tuple(mapped), tuple(one.note(drive) for one in [*refused, *failed]))
 
 
 def frames_text(drive: Drive, rows: Int[np.ndarray, "n"]) -> str:
-    """Name rows of a drive by the frame numbers of their first and last ones, run by run."""
-    runs = [rows[run] for run in equal_runs(rows - np.arange(len(rows)))]
-    return "frames " + ", ".join(f"{drive.frames[run[0]]}-{drive.frames[run[-1]]}" for run in runs)
+    """Name rows of a drive by the numbers of the first and the last frame of each of the first few runs."""
+    runs = [drive.frames[rows[run]] for run in equal_runs(rows - np.arange(len(rows)))]
+    named = [str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:_NAMED_RUNS]]
+    more = f" and {counted(len(runs) - _NAMED_RUNS, 'further run')}" if len(runs) > _NAMED_RUNS else ""
+    return f"{'frame' if len(rows) == 1 else 'frames'} {', '.join(named)}{more}"

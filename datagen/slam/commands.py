@@ -64,6 +64,18 @@ class CommandedMotion:
         """Commands of frames that follow one another, each a typical time step after the one before."""
         return cls(distance_cm, speed_known, turn, np.ones(len(distance_cm)))
 
+    def only(self, rows: Int[np.ndarray, "m"]) -> CommandedMotion:
+        """Return the commands of some parts, given by all of their rows; nothing lies before the first."""
+        periods = self.periods[rows]
+        periods[:1] = 1.0
+        return replace(
+            self,
+            distance_cm=self.distance_cm[rows],
+            turn=None if self.turn is None else self.turn[rows],
+            periods=periods,
+            uneven=None if self.uneven is None else self.uneven[rows],
+        )
+
     @property
     def relative_steps(self) -> Float[np.ndarray, "n"]:
         """Commanded step lengths relative to the typical one; 0 where the car was commanded to stand."""

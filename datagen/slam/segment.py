@@ -28,14 +28,22 @@ from datagen.slam.loops.consistency import (
     with_supported,
     without_contradicted,
 )
-from datagen.slam.loops.parts import connected, placing_revisits, whole_turns
+from datagen.slam.loops.parts import LEAST_TIED, connected, placing_revisits, tied_frames, whole_turns
 from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
 from datagen.slam.loops.revisits import PlaceMatcher, Revisit, propose_beside, propose_revisits, thumbnails
 from datagen.slam.odometry.scans import Scans
 from datagen.slam.settings import SlamSettings
 from datagen.slam.track import track
-from datagen.slam.view import RoadView, SegmentView, view_road, view_segment, with_measured_periods
+from datagen.slam.view import (
+    LEAST_POINTS,
+    RoadView,
+    SegmentView,
+    view_road,
+    view_segment,
+    with_measured_periods,
+)
 from lanenet.data.drives import Drive
+from lanenet.errors import TrackingLostError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.poses import path_lengths
 
@@ -200,13 +208,30 @@ class SegmentSolver:
             commands = commands_of(drive, camera.wheelbase_cm)
         view = view_segment(drive, camera, commands, self.settings, self.rng)
         keys = choose_keyframes(view.steps_heights, commands.part)
+        tied = tied_frames(commands.part, keys, view.road.shows_road)
+        if not len(tied):
+            raise TrackingLostError(
+                f"{drive.path}: {counted(len(drive), 'frame')} in "
+                f"{counted(int(commands.part.max()) + 1, 'part')} between breaks, none with {LEAST_TIED} "
+                f"frames that show {LEAST_POINTS} edge points on the road; mapping needs a recording without "
+                "breaks"
+            )
+        if len(tied) < len(drive):
+            solved = self.solve(drive.subset(tied), camera, find_camera, prior_camera, commands.only(tied))
+            return replace(solved, rows=tied[solved.rows])
         if len(keys) == len(drive):
             view = with_measured_periods(view)
             return _DenseSegment(view, self, find_camera, prior_camera or camera).solve()
         # The keyframes show the step length better: if the car is still slow, they are thinned again.
         between = commands_between(commands, keys)
         solved = self.solve(drive.subset(keys), camera, find_camera, prior_camera, between)
-        return self.place_between(solved, keys, view.steps_heights, drive, commands)
+        keys = keys[solved.rows]
+        rows = np.flatnonzero(np.isin(commands.part, commands.part[keys]))
+        drive, commands = drive.subset(rows), commands.only(rows)
+        placed = self.place_between(
+            solved, np.searchsorted(rows, keys), view.steps_heights[rows], drive, commands
+        )
+        return replace(placed, rows=rows)
 
     def tell(self, stage: str, done: int, total: int) -> None:
         """Report progress, if anybody listens."""

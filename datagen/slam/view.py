@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from datagen.slam.adjustment.adjust import Observations
 from datagen.slam.commands import CommandedMotion
@@ -28,9 +28,9 @@ _COARSEST_HEIGHTS = 0.3
 #: Range of the mapping, in camera heights. Far edges place a line badly, but hold the heading. With a focal
 #: length of 120 px a pixel spans as much as the limit above there; with 80 px it does at 4.9 heights.
 _REACH_HEIGHTS = 6.0
-#: Edge points per frame, on average, below which a segment cannot be tracked. Chosen: road without lines, but
-#: with seams and stains, has more; a blank floor has hardly any.
-_LEAST_POINTS = 20
+#: Edge points below which a frame shows no road, and below which, on average, a segment cannot be tracked.
+#: Chosen: road without lines, but with seams and stains, has more; a blank floor has hardly any.
+LEAST_POINTS = 20
 
 
 def mapping_range(mounting: Mounting, base: RangeSettings) -> RangeSettings:
@@ -54,6 +54,11 @@ class RoadView:
     edges: list[EdgePixels]
     keep: UInt8[np.ndarray, "h w"]
     limits: RangeSettings
+
+    @property
+    def shows_road(self) -> Bool[np.ndarray, "n"]:
+        """Frames with enough edges on the road to be tracked by."""
+        return np.array([len(pixels.uv_px) >= LEAST_POINTS for pixels in self.edges])
 
     def scans(self, camera: Camera, tilt_rad: Float[np.ndarray, "n 2"] | None = None) -> Scans:
         """Move the edges to the road, with the camera tilted in each frame beyond its mounting."""
@@ -159,10 +164,10 @@ def view_segment(
     """
     road = view_road(drive, camera, settings)
     scans = road.scans(camera)
-    if len(scans.points_cm) < _LEAST_POINTS * len(scans):
+    if len(scans.points_cm) < LEAST_POINTS * len(scans):
         raise TrackingLostError(
             f"{drive.path}: {len(scans.points_cm) / max(len(scans), 1):.0f} edge points per frame on the "
-            f"road; mapping needs {_LEAST_POINTS}"
+            f"road; mapping needs {LEAST_POINTS}"
         )
     images = ImagePairs(road.edges, camera, settings.odometry, rng, commands.periods)
     typical = typical_step(images, commands.distance_cm, commands.speed_known)

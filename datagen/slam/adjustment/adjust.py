@@ -54,6 +54,10 @@ __all__ = ["CAMERA_NAMES", "BundleEstimate", "BundleResult", "BundleSettings", "
 #: Share of the diagonal that is added to it. A bend of the whole drive hardly changes any one frame's
 #: residuals: with 1e-4, an error that all turns have in common was still there after all rounds.
 _DAMPING = 1e-8
+#: Least diagonal that damping counts with, so that a number that nothing observes stays where it is: no
+#: equation has it where the car was commanded to stand and no edge is seen. Ceres has the same default
+#: (min_lm_diagonal).
+_LEAST_DIAGONAL = 1e-6
 #: The same where no step is taken. Chosen: far above rounding, far below what any frame is known by.
 _AFLOAT = 1e-9
 #: Relative fall of the cost at which a round ends early. Chosen: it only saves
@@ -216,8 +220,7 @@ class Equations:
             damping: Share of the diagonal that is added to it.
         """
         count = len(self.border)
-        frames = (self.frames + damping * diags(self.frames.diagonal())).tocsc()
-        reduced = _Factorised(frames).solve(np.column_stack([self.descent[:count], self.border]))
+        reduced = self.factorised(damping).solve(np.column_stack([self.descent[:count], self.border]))
         if not self.border.shape[1]:
             return np.asarray(reduced[:, 0])
         camera = self.camera + damping * np.diag(np.diag(self.camera))
@@ -225,11 +228,15 @@ class Equations:
         found = np.linalg.solve(schur, self.descent[count:] - self.border.T @ reduced[:, 0])
         return np.concatenate([reduced[:, 0] - reduced[:, 1:] @ found, found])
 
+    def factorised(self, damping: float) -> _Factorised:
+        """Factorise H of the frames with a share of its diagonal added."""
+        diagonal = np.maximum(self.frames.diagonal(), _LEAST_DIAGONAL)
+        return _Factorised((self.frames + damping * diags(diagonal)).tocsc())
+
     def without_frames(self) -> tuple[Float[np.ndarray, "f f"], Float[np.ndarray, "u f"]]:
         """Return H of the camera with the frames eliminated, and how the frames follow the camera."""
         # A part of the drive that nothing joins to the others may lie anywhere.
-        frames = (self.frames + _AFLOAT * diags(self.frames.diagonal())).tocsc()
-        follow = -_Factorised(frames).solve(self.border)
+        follow = -self.factorised(_AFLOAT).solve(self.border)
         return self.camera + self.border.T @ follow, follow
 
 

@@ -4,6 +4,8 @@ A drive is recorded in parts: the driver paused, lifted the car and put it elsew
 that no image bridges the gap. Nothing is known of the motion from one part to the next. Where one shows
 places of another, each revisit between them places it there; those that agree carry it over. What hangs
 together this way is one map; what does not has a map of its own.
+
+A part of a few frames is no map: neither the images nor the motion model determine its poses.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from datagen.slam.loops.consistency import AGREE_HEIGHTS, AGREE_RAD, AGREE_SHARE, count_places
 from datagen.slam.loops.revisits import Revisit
@@ -22,6 +24,10 @@ from lanenet.geometry.poses import compose, moved_rigidly, path_lengths, relativ
 #: Separate places at which revisits must agree to place one part on another. Chosen: one place may look like
 #: another one by chance; that a second one at the right distance from it does, too, is rare.
 _LEAST_PLACES = 2
+#: Frames of a part that show the road, without which its poses are not determined. Chosen: the motion model
+#: holds only changes of speed and of turn, which takes three frames; speed and turn themselves are left to
+#: the images, and a fourth frame checks them.
+LEAST_TIED = 4
 
 
 def placing_revisits(
@@ -77,6 +83,26 @@ def connected(part: Int[np.ndarray, "n"], revisits: Sequence[Revisit]) -> Int[np
         group[group == group[r.later]] = group[r.earlier]
     _, first, number = np.unique(group, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[number])
+
+
+def tied_frames(
+    part: Int[np.ndarray, "n"], keys: Int[np.ndarray, "k"], shows_road: Bool[np.ndarray, "n"]
+) -> Int[np.ndarray, "m"]:
+    """Choose the parts whose poses are determined: all others would make the adjustment singular.
+
+    No revisit makes up for it: a part is placed by places some camera heights apart, and one this short shows
+    one place.
+
+    Args:
+        part: Part of the drive that each frame belongs to.
+        keys: Keyframes by which the drive is tracked.
+        shows_road: Frames that show edges of the road.
+
+    Returns:
+        All frames of these parts, in ascending order.
+    """
+    tying = np.bincount(part[keys], weights=shows_road[keys], minlength=int(part.max()) + 1)
+    return np.flatnonzero(tying[part] >= LEAST_TIED)
 
 
 def _largest_agreeing(

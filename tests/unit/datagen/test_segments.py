@@ -84,6 +84,29 @@ def test_a_short_part_on_no_known_road_is_left_out_and_said(monkeypatch):
     )
 
 
+def test_frames_that_nothing_ties_are_said_in_one_note_as_are_short_parts(monkeypatch):
+    drive = made_up_drive(300, [100, 101, 110, 111], first_frame=1000)
+    tied = np.setdiff1d(np.arange(300), [100, 110, *range(200, 220, 2)])
+    whole = _in_parts(drive, [])
+    monkeypatch.setattr(SegmentSolver, "solve", lambda self, part, camera: whole.only(tied))
+    prepared, solver = _prepared(drive), SegmentSolver(SETTINGS, np.random.default_rng(0))
+    camera = drive_segments.camera_of_drive(prepared, solver)
+    solved = drive_segments.solve_drive(prepared, camera, solver)
+    short, untied = (one.note(drive) for one in solved.refused)
+    assert short.startswith("frames 1101-1109 left out: 9 frames that show no place")
+    assert untied.startswith(
+        "frames 1100, 1110, 1200, 1202, 1204 and 7 further runs left out: nothing ties them"
+    )
+    # Neither is why a segment has no lane.
+    monkeypatch.setattr(drive_segments, "find_lane", _no_lane)
+    with pytest.raises(TrackingLostError, match="no lane in 179 frames"):
+        drive_segments.fit_lanes(prepared, solved.segments, [replace(solved.refused[0], rows=np.arange(300))])
+
+
+def _no_lane(segment: SolvedSegment, *_: object) -> MappedSegment:
+    raise TrackingLostError(f"no lane in {len(segment.rows)} frames")
+
+
 def test_a_drive_of_scraps_cannot_be_mapped(monkeypatch):
     with pytest.raises(TrackingLostError, match=r"120 frames in 3 parts.* 50 frames.* 60"):
         _solve(monkeypatch, made_up_drive(120, [50, 90]), [])

@@ -64,6 +64,25 @@ def test_a_step_and_the_uncertainty_are_those_of_the_full_system(free, damping):
     np.testing.assert_allclose(follow, -np.linalg.solve(frames.toarray(), border), rtol=1e-7, atol=1e-12)
 
 
+@pytest.mark.parametrize("most_band", [0, 50_000_000])
+def test_numbers_that_no_equation_has_stay_and_the_others_move(monkeypatch, most_band):
+    """A frame without an edge, of a car that was commanded to stand, has zeros in its rows."""
+    monkeypatch.setattr("datagen.slam.adjustment.adjust._MOST_BAND", most_band)
+    held = csc_matrix(2.0 * np.eye(N_FRAME))
+    nothing = csc_matrix((N_FRAME, N_FRAME))
+    border = np.concatenate([np.full((N_FRAME, 1), 0.5), np.zeros((N_FRAME, 1))])
+    descent = np.concatenate([np.ones(N_FRAME), np.zeros(N_FRAME + 1)])
+    now = Equations(1.0, block_diag([held, nothing]).tocsc(), border, np.array([[5.0]]), descent, np.zeros(0))
+    step = now.step(1e-8)
+    assert not step[N_FRAME : 2 * N_FRAME].any()
+    full = np.block([[2.0 * np.eye(N_FRAME), border[:N_FRAME]], [border[:N_FRAME].T, np.array([[5.0]])]])
+    expected = np.linalg.solve(full, np.append(descent[:N_FRAME], 0.0))
+    np.testing.assert_allclose(np.append(step[:N_FRAME], step[-1]), expected, rtol=1e-6)
+    information, follow = now.without_frames()
+    np.testing.assert_allclose(information, [[5.0 - N_FRAME * 0.5**2 / 2.0]], rtol=1e-6)
+    assert np.isfinite(follow).all()
+
+
 def test_frames_that_nothing_joins_to_the_others_leave_the_camera_as_sure_as_it_was():
     """What joins them to each other says nothing of where they lie: their block is singular."""
     each = csc_matrix(np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(N_FRAME)))

@@ -13,11 +13,12 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.commands import BREAK_PERIODS, commands_of, habitual_pauses
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.parts import connected, placing_revisits
+from datagen.slam.loops.parts import connected, placing_revisits, tied_frames
 from datagen.slam.loops.pose_graph import close_loops, loop_pairs
 from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from lanenet.data.drives.recording import Commands, Drive
+from lanenet.errors import TrackingLostError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.poses import moved_rigidly, relative_pose
 
@@ -167,3 +168,47 @@ def test_pauses_of_a_recording_are_counted_where_they_are_a_habit():
         steps[5 : 5 + 9 * len(missing) : 9] += missing
         assert habitual_pauses(replace(whole, t_s=0.05 * np.cumsum(steps))) == expected
     assert habitual_pauses(made_up_drive([image])) == 0
+
+
+@pytest.mark.parametrize(
+    ("sizes", "dark", "keys", "kept"),
+    [
+        ([6], [], None, [0]),
+        ([4, 1, 5], [], None, [0, 2]),
+        ([1, 2, 3, 4], [], None, [3]),
+        ([1, 1, 1], [], None, []),
+        # Frames that show no road tie nothing, but stay in a part that others tie.
+        ([4, 8], [0], None, [1]),
+        ([5, 8], [0, 5, 6, 7, 8, 9], None, [0]),
+        # A slow car is tracked by its keyframes.
+        ([9, 9], [], [0, 3, 6, 8, 9, 13, 17], [0]),
+    ],
+)
+def test_parts_that_nothing_ties_are_left_out(sizes, dark, keys, kept):
+    part = np.repeat(np.arange(len(sizes)), sizes)
+    shows_road = ~np.isin(np.arange(len(part)), dark)
+    found = tied_frames(part, np.arange(len(part)) if keys is None else np.array(keys), shows_road)
+    np.testing.assert_array_equal(found, np.flatnonzero(np.isin(part, kept)))
+
+
+@pytest.mark.parametrize("alone", [1, 3])
+def test_a_few_frames_between_two_breaks_are_left_out_of_the_segment(alone):
+    """The images before and after them do not show where they are, and neither does the motion model."""
+    drive, _ = loop_drive(_camera(), 60 + alone, LAP_FRAMES, LAP_CM, 0)
+    apart = np.where(np.arange(len(drive)) >= 30, 251.0, 0.0)
+    apart += np.where(np.arange(len(drive)) >= 30 + alone, 10.0, 0.0)
+    breaks = np.isin(np.arange(len(drive)), [30, 30 + alone])
+    speed = Commands(speed_cm_s=np.full(len(drive), LAP_CM / LAP_FRAMES / 0.05))
+    broken = replace(drive, t_s=drive.t_s + apart, breaks=breaks, commands=speed)
+    segment = SegmentSolver(SMALL, np.random.default_rng(0)).solve(broken, _camera())
+    np.testing.assert_array_equal(segment.rows, np.r_[0:30, 30 + alone : 60 + alone])
+    assert np.isfinite(segment.poses).all()
+    np.testing.assert_array_equal(segment.part, np.repeat([0, 1], 30))
+
+
+def test_a_recording_of_single_frames_is_refused_in_one_line():
+    drive, _ = loop_drive(_camera(), 20, LAP_FRAMES, LAP_CM, 0)
+    k = np.arange(len(drive))
+    broken = replace(drive, t_s=drive.t_s + 10.0 * k, breaks=k > 0)
+    with pytest.raises(TrackingLostError, match=r"20 frames in 20 parts between breaks, none with 4 frames"):
+        SegmentSolver(SMALL, np.random.default_rng(0)).solve(broken, _camera())
