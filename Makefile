@@ -21,7 +21,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train general install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
@@ -39,6 +39,7 @@ help:
 	@echo "make fleet        sixty drives on a Ray cluster whose nodes are killed, against one process"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
+	@echo "make donkeycar    the pilot in donkeycar 5.3's own vehicle, driven from its own page (needs python3.11)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
 	@echo "make pictures     the moving picture of the README, from a recorded drive (DRIVE, LANE_WIDTH, SHOWN)"
 	@echo "make release      source archive and wheel of this version into dist/ (needs g++)"
@@ -122,6 +123,17 @@ golden: $(VENV)/.stamp-dev
 
 golden-renew: $(VENV)/.stamp-dev
 	$(BIN)/python tests/golden/renew.py
+
+# Donkeycar pins Python and NumPy, hence an environment of its own. Another one: LANENET_DONKEYCAR=FOLDER make donkeycar
+LANENET_DONKEYCAR ?= $(abspath .venv-donkeycar)
+donkeycar: $(VENV)/.stamp-dev $(LANENET_DONKEYCAR)/.stamp
+	LANENET_DONKEYCAR=$(LANENET_DONKEYCAR) $(PYTEST) -rs --numprocesses 0 tests/contracts/test_donkeycar.py
+
+$(LANENET_DONKEYCAR)/.stamp: contrib/donkeycar.txt pyproject.toml $(KERNELS)
+	@command -v python3.11 >/dev/null || { echo "error: no python3.11 found, which donkeycar 5.3 needs" >&2; exit 1; }
+	python3.11 -m venv $(LANENET_DONKEYCAR)
+	$(LANENET_DONKEYCAR)/bin/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c contrib/donkeycar.txt donkeycar -e .
+	touch $@
 
 # Maps the drive first, which takes some minutes, unless that was done before.
 DRIVE ?= $(LANENET_SHARED_DATA)/donkey_circuit
