@@ -33,7 +33,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from lanenet.errors import LanenetError, MotorMayRunError
 from lanenet.onboard.i2c import I2CChip
@@ -94,15 +94,18 @@ class Guard:
 
     def _oversee(self, ended: threading.Event) -> None:
         """Send neutral while a driver hangs in a command, until it continues."""
-        logged_s = math.inf
         while not ended.wait(_LOOK_S):
             begun_s = self._busy_s
             if time.monotonic() - begun_s <= _SLOW_S:
                 continue
-            left = self._actuator.neutral()
-            if begun_s != logged_s and left is not None:
-                logged_s = begun_s
-                log.warning("%s: the actuator's driver hangs in a command", left.text)
+            log.warning("the actuator's driver hangs in a command: neutral is tried past it")
+            settle(self._actuator.neutral, partial(self._is_past, begun_s))
+            if not self._is_past(begun_s):
+                # The loop would have killed this process: it is gone, and so is every way to neutral.
+                give_up(Neutral(False, "the actuator's driver does not return"))
+
+    def _is_past(self, begun_s: float) -> bool:
+        return self._busy_s != begun_s
 
     @contextmanager
     def _busy(self) -> Iterator[None]:
@@ -208,6 +211,13 @@ class Guard:
 
     def _say(self, text: str) -> None:
         _say(self._line, text)
+
+
+def give_up(left: Neutral) -> NoReturn:
+    """Say that the motor may run, and end the process although a thread of it hangs in the driver."""
+    log.critical(left.may_run)
+    logging.shutdown()
+    os._exit(MotorMayRunError.exit_code)
 
 
 def beat(pulse: int) -> None:

@@ -103,6 +103,7 @@ def run(case: Case, folder: Path) -> Result:
         except AssertionError as error:
             return Result(math.inf, None, log.read_text(errors="replace"), str(error))
         time.sleep(0.1 + case.moment / RATE_HZ)
+        before = log.stat().st_size
         begin_s = time.monotonic()
         (folder / "outage.new").write_text(f"{begin_s + case.outage_s} {case.manner}")
         (folder / "outage.new").rename(folder / "outage")
@@ -113,15 +114,17 @@ def run(case: Case, folder: Path) -> Result:
         early = ""
         while time.monotonic() < end_s and (wire.motor()[-1][1] or time.monotonic() < after_s):
             if not early and time.monotonic() < begin_s + case.outage_s:
-                early = _claim(log, wire, begin_s)
+                early = _claim(log, before, wire, begin_s)
             time.sleep(0.01)
+        if case.outage_s > PATIENCE_S:
+            _wait_for(log, "disconnect the battery", 3.0)
         time.sleep(WATCHED_S)
         stopped_s, runs = wire.motor()[-1]
         drives_on = case.fault == "drives on" and process.poll() is None and runs
         last = ended if ended is not None else process
         code = None if drives_on else _code(last, 3.0)
         late_s = math.inf if runs else stopped_s - after_s
-        return _judge(case, drives_on, late_s, code, log, early or _claim(log, wire, begin_s))
+        return _judge(case, drives_on, late_s, code, log, early or _claim(log, before, wire, begin_s))
     finally:
         for pid in (process.pid, guard):
             if pid:
@@ -154,9 +157,10 @@ def _strike(
         return subprocess.Popen(words, env=environment, stdout=stream, stderr=stream)
 
 
-def _claim(log: Path, wire: Wire, since_s: float) -> str:
+def _claim(log: Path, before: int, wire: Wire, since_s: float) -> str:
     """Return the line that says neutral, without an addition, while the motor runs; empty if none does."""
-    lines = [line for line in log.read_text(errors="replace").splitlines() if _CLAIM.match(line)]
+    said = log.read_bytes()[before:].decode(errors="replace")
+    lines = [line for line in said.splitlines() if _CLAIM.match(line)]
     runs = wire.motor()[-1][1] or not [w for w in wire.throttles(driving=False) if w.t_s >= since_s]
     return lines[0] if lines and runs else ""
 
@@ -183,6 +187,12 @@ def _judge(case: Case, drives_on: bool, late_s: float, code: int | None, log: Pa
         if case.fault != "loop killed" and code != MotorMayRunError.exit_code:
             wrong.append(f"code {code}, expected {MotorMayRunError.exit_code}")
     return Result(late_s, code, said, "; ".join(wrong))
+
+
+def _wait_for(log: Path, text: str, timeout_s: float) -> None:
+    end_s = time.monotonic() + timeout_s
+    while text not in log.read_text(errors="replace") and time.monotonic() < end_s:
+        time.sleep(0.05)
 
 
 def _code(process: subprocess.Popen[bytes], timeout_s: float) -> int | None:

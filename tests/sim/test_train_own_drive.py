@@ -14,6 +14,7 @@ from typer.testing import CliRunner, Result
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.cli.app import app
+from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import read_labels
@@ -86,14 +87,28 @@ def test_one_command_goes_from_a_drive_to_a_network(here: Path, first: str) -> N
     assert (here / "runs" / "mycar" / "test.mp4").stat().st_size > 10_000
     seen = np.loadtxt(here / "runs" / "mycar" / "test.csv", delimiter=",", skiprows=1, usecols=0)
     assert seen[0] == parts["test"].frame[0] and seen[-1] == parts["test"].frame[-1]
-    camera = Path("checkpoints") / "mycar" / "camera.yaml"
-    next_command = f"next: lanenet detect {here / 'drive'} --model checkpoints/mycar --camera {camera}"
-    assert f"{next_command} --lane-width 40 --out runs/lanes.csv" in first
+    assert "next: lanenet doctor --config CAR.yaml" in first
     # All of it is in the log, with times, and what is left of the stages.
     log = (here / "runs" / "mycar" / "train.log").read_text()
     for line in first.splitlines()[1:]:
         assert line.strip() in log or "│" in line or "─" in line or not line.strip() or "RMSE" in line
     assert "map: " in log and f"of {2 * FRAMES}" in log
+
+
+def test_a_label_set_gives_what_its_map_gives(here: Path, first: str) -> None:
+    (of_map,) = here.glob("runs/mycar/drives/maps/drive-*")
+    result = CliRunner().invoke(app, ["label", str(of_map), "--out", "set.parquet"])
+    assert result.exit_code == 0, result.output
+    result = train("set.parquet", "--name", "fromset", "learn.epochs=1")
+    assert result.exit_code == 0, result.output
+    assert "holds no images" in result.stderr and "holds no camera" not in result.stderr
+    read = {}
+    for name in ("mycar", "fromset"):
+        results = json.loads((here / "checkpoints" / name / "results.json").read_text())
+        read[name] = results["detectors"]["network"]["groups"]["all"]["rmse_cm"]
+    assert read["fromset"] == pytest.approx(read["mycar"], abs=0.02)
+    own, other = (here / "checkpoints" / name / "camera.yaml" for name in ("mycar", "fromset"))
+    assert read_camera(own).hash == read_camera(other).hash
 
 
 def test_its_config_does_the_same_from_another_folder(
