@@ -29,6 +29,9 @@ MEBIBYTE = 2**20
 #: Chosen: lists in JSON take about twenty times their text in memory, so 32 MB stay below a gigabyte. The
 #: largest files, the lane lines of an hour's drive, have 2 MB.
 MAX_JSON = 32 * MEBIBYTE
+#: What a packed file may stand for: so much, and so many times its size. Chosen: label sets unpack to 2 to 20
+#: times their size, small ones of a still car, and images of flat colours, to more.
+_MAX_UNPACKED, _MAX_RATIO = 256 * MEBIBYTE, 100
 #: A photo, or an image of a drive. Chosen: above the 30 MB of a phone's best JPEG.
 MAX_IMAGE = 64 * MEBIBYTE
 #: Of an image. Chosen: above the 50 megapixels of a phone; 192 MB decoded.
@@ -104,6 +107,11 @@ def is_folder(path: Path) -> bool:
         return stat.S_ISDIR(path.stat().st_mode)
     except (OSError, ValueError):
         return False
+
+
+def most_unpacked(size: int) -> int:
+    """Return how much a packed file of some size may stand for, [B]."""
+    return _MAX_UNPACKED + _MAX_RATIO * size
 
 
 def natural_key(name: object) -> list[tuple[int, int, str]]:

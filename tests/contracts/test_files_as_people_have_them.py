@@ -5,19 +5,23 @@ The kinds are those of public reports; docs/formats.md has the table of what is 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pickle
 import shutil
+import sqlite3
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from bags import START_NS, Messages, message, usual, write_bag
 from commands import refused
-from drives import frame_image, record, write_drive, write_tub
+from drives import edit, frame_image, record, write_drive, write_tub
+from mcap.writer import Writer as McapWriter
 from mp4 import Change, change_boxes, timed, turned
 from PIL import Image
 from typer.testing import CliRunner
@@ -405,6 +409,182 @@ def test_a_video_is_turned_as_it_says(tmp_path: Path, degrees: int) -> None:
     drive = open_drive(video(turned(degrees), "turned.mp4")(tmp_path))
     assert (drive.height, drive.width) == ((48, 64) if degrees % 180 == 0 else (64, 48))
     np.testing.assert_array_equal(drive.image(3), np.rot90(upright, -degrees // 90))
+
+
+# Bags: metadata are written when the recording ends.
+
+
+def bag(
+    change: Callable[[Path], None] = lambda path: None, storage: str = "mcap", topics: Messages | None = None
+) -> Make:
+    def make(folder: Path) -> Path:
+        path = write_bag(folder / "lap", topics or usual(), storage)
+        change(path)
+        return path
+
+    return make
+
+
+def split(metadata: Callable[[Path], None]) -> Make:
+    """A bag in eleven files, one for each image, numbered as rosbag2 does; with other metadata."""
+
+    def make(folder: Path) -> Path:
+        topics = usual(11)
+        for k in range(11):
+            part = {name: messages[k : k + 1] for name, messages in topics.items()}
+            write_bag(folder / f"lap_{k}", part)
+        path = folder / "lap_0"
+        for k in range(1, 11):
+            shutil.move(folder / f"lap_{k}" / f"lap_{k}.db3", path)
+        metadata(path)
+        return path
+
+    return make
+
+
+def half_in_the_log(path: Path) -> None:
+    """As a recorder leaves a bag that is killed."""
+    file = path / "lap.db3"
+    live = path.with_name("live.db3")
+    shutil.copy(file, live)
+    with contextlib.closing(sqlite3.connect(live)) as database:
+        rows = database.execute("SELECT * FROM messages ORDER BY timestamp").fetchall()
+        database.execute("DELETE FROM messages")
+        database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows[:6])
+        database.commit()
+        database.execute("PRAGMA journal_mode = wal")
+        database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows[6:])
+        database.commit()
+        for ending in ("", "-wal"):
+            shutil.copy(f"{live}{ending}", f"{file}{ending}")
+    live.unlink()
+
+
+def many_topics() -> Messages:
+    times = [(START_NS + k, message("std_msgs/msg/String", data="x")) for k in range(2)]
+    return {**{f"/robot/part_{k}/state": times for k in range(180)}, **usual()}
+
+
+def foreign(schema: str, encoding: str, schema_encoding: str) -> Make:
+    """Images of another recorder as an MCAP file."""
+
+    def make(folder: Path) -> Path:
+        with (folder / "race.mcap").open("wb") as stream:
+            writer = McapWriter(stream)
+            writer.start()
+            number = writer.register_schema(schema, schema_encoding, b"")
+            channel = writer.register_channel("/camera", encoding, number)
+            writer.add_message(channel, START_NS, b"0123", START_NS)
+            writer.finish()
+        return folder / "race.mcap"
+
+    return make
+
+
+def images_as(form: str, data: bytes = b"\0\0\0\1\x67" + bytes(99)) -> Messages:
+    name, messages = next(iter(usual().items()))
+    packed = [(t, replace(each, format=form, data=np.frombuffer(data, np.uint8))) for t, each in messages]
+    return {name: packed, "/drive": usual()["/drive"]}
+
+
+def no_metadata(path: Path) -> None:
+    (path / "metadata.yaml").unlink()
+
+
+SIX, ELEVEN = list(range(6)), list(range(11))
+UNPACKED = ("compression_mode: ''", "compression_mode: NONE")
+BAGS = [
+    Case("unpacked by hand", bag(lambda path: edit(path / "metadata.yaml", *UNPACKED)), SIX),
+    Case("no metadata", bag(no_metadata), SIX, ("metadata.yaml: names no file",)),
+    Case("no metadata, in parts", split(no_metadata), ELEVEN, ("names no file",)),
+    Case(
+        "empty metadata", bag(lambda path: (path / "metadata.yaml").write_bytes(b"")), SIX, ("names no file",)
+    ),
+    Case(
+        "zeroed metadata",
+        bag(lambda path: (path / "metadata.yaml").write_bytes(bytes(99))),
+        SIX,
+        ("no file",),
+    ),
+    Case("old metadata", split(lambda path: None), ELEVEN, ("does not list lap_1.db3, lap_2.db3",)),
+    Case(
+        "metadata of Windows",
+        bag(lambda path: edit(path / "metadata.yaml", "- lap.mcap", "- 'C:\\bags\\lap\\lap.mcap'")),
+        SIX,
+    ),
+    Case("the newest half in the log", bag(half_in_the_log, "sqlite3"), SIX),
+    Case("180 topics", bag(topics=many_topics()), SIX),
+    Case(
+        "180 topics and no image",
+        bag(topics={name: each for name, each in many_topics().items() if "camera" not in name}),
+        [],
+        ("no topic of images", "found /drive (ackermann_msgs", "and 169 more"),
+    ),
+    Case(
+        "ROS 1 in MCAP",
+        foreign("sensor_msgs/CompressedImage", "ros1", "ros1msg"),
+        [],
+        ("messages of ROS 1", "rosbags-convert --src race.bag --dst race"),
+    ),
+    Case(
+        "Protobuf", foreign("foxglove.CompressedImage", "protobuf", "protobuf"), [], ("record them in CDR",)
+    ),
+    Case("a video in MCAP", foreign("foxglove.CompressedVideo", "json", "jsonschema"), [], ("republish",)),
+    Case("H.264 as an image", bag(topics=images_as("h264")), [], ("'h264'", "JPEG or PNG", "republish")),
+    Case("no image as an image", bag(topics=images_as("jpeg")), [], ("not a readable image",)),
+]
+
+
+@table(BAGS)
+def test_bags(tmp_path: Path, case: Case) -> None:
+    case.check(tmp_path)
+
+
+def test_nothing_is_written_beside_a_bag_that_was_not_closed(tmp_path: Path) -> None:
+    path = bag(half_in_the_log, "sqlite3")(tmp_path)
+    before = {file: file.read_bytes() for file in sorted(path.iterdir())}
+    assert len(before) == 3 and len(open_drive(path)) == 6
+    assert {file: file.read_bytes() for file in sorted(path.iterdir())} == before
+
+
+def test_a_bag_in_parts_is_in_order(tmp_path: Path) -> None:
+    drive = open_drive(split(no_metadata)(tmp_path))
+    assert [number(drive.image(k)) for k in range(11)] == ELEVEN
+    # Several recordings in a folder are several drives.
+    (tmp_path / "folder").mkdir()
+    for name in ("monday", "tuesday"):
+        shutil.copy(write_bag(tmp_path / name, usual(), "mcap") / f"{name}.mcap", tmp_path / "folder")
+    with pytest.raises(
+        DriveFormatError, match=r"there are drives in it: type .*monday\.mcap, .*tuesday\.mcap"
+    ):
+        open_drive(tmp_path / "folder")
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_mosaic_is_one_in_a_compressed_image(tmp_path: Path, pattern: str, bits: int) -> None:
+    """image_transport packs what the camera gives, and says only in the format what it is."""
+    colour = np.array([30, 90, 200], np.uint8)
+    mosaic = np.empty((8, 12), np.uint8)
+    for place, letter in enumerate(pattern):
+        mosaic[place // 2 :: 2, place % 2 :: 2] = colour["bgr".index(letter)]
+    stored = mosaic.astype(np.uint16) * 257 if bits == 16 else mosaic
+    data = cv2.imencode(".png", stored)[1].tobytes()
+    topics = images_as(f"bayer_{pattern}{bits}; png compressed ", data)
+    image = open_drive(write_bag(tmp_path / "lap", topics)).image(0)
+    np.testing.assert_array_equal(image, np.broadcast_to(colour, (8, 12, 3)))
+
+
+@pytest.mark.parametrize(
+    ("form", "swapped"),
+    [("rgb8; jpeg compressed bgr8", False), ("bgr8; png compressed rgb8", True), ("png", False), ("", False)],
+)
+def test_the_colours_of_a_compressed_image(tmp_path: Path, form: str, swapped: bool) -> None:
+    image = frame_image(3)
+    data = cv2.imencode(".png", image[..., ::-1] if swapped else image)[1].tobytes()
+    np.testing.assert_array_equal(
+        open_drive(write_bag(tmp_path / "lap", images_as(form, data))).image(0), image
+    )
 
 
 # Photos.

@@ -7,14 +7,17 @@ the last command before it: that which the car was obeying. Where there are seve
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lanenet.data.drives.bag.messages import COMMAND_TYPES, IMAGE_TYPES, Decoder
-from lanenet.data.drives.bag.storage import METADATA_FILE, STORAGE_ENDINGS, Bag, Topic
+from lanenet.data.drives.bag.messages import COMMAND_TYPES, IMAGE_TYPES, VIDEO_REMEDY, Decoder
+from lanenet.data.drives.bag.storage import METADATA_FILE, STORAGE_ENDINGS, Bag, is_bag
+from lanenet.data.drives.bag.topic import READABLE, Topic
 from lanenet.data.drives.recording import (
     COMMAND_SPECS,
     DRIVE_FILE,
@@ -27,7 +30,6 @@ from lanenet.data.drives.recording import (
     read_drive_file,
 )
 from lanenet.errors import DriveFormatError
-from lanenet.reading import is_regular
 
 _COMMANDS = ("speed_cm_s", "steering_rad", "yaw_rate_rad_s")
 #: A command is obeyed until the next, but not for ever: drivers of cars stop one that hears nothing. A longer
@@ -38,6 +40,8 @@ _SAME_CLOCK_NS = 2_000_000_000
 #: Up to this many frames ahead, reading on is taken to be faster than a seek, which unpacks a chunk. Chosen:
 #: a chunk of MCAP has a megabyte, some ten small images.
 _MAX_FORWARD = 10
+#: Topics that an error lists; chosen: they fit a screen.
+_MAX_LISTED = 12
 
 
 class BagImages:
@@ -108,13 +112,15 @@ def read_bag(path: Path) -> RecordedFrames:
     if absent := [name for name in wanted if name not in {topic.name for topic in bag.topics}]:
         raise DriveFormatError(f"{drive_file_of(path)}: key 'topics': no topic {absent[0]}; {_found(bag)}")
     topics = [topic for topic in bag.topics if topic.count and (not wanted or topic.name in wanted)]
+    topics = [topic for topic in topics if topic.encoding in READABLE]
     pictures = _pictures(bag, [topic for topic in topics if topic.type in IMAGE_TYPES])
     if not pictures:
         raise DriveFormatError(
-            f"{path}: no topic of images, expected {' or '.join(IMAGE_TYPES)}; {_found(bag)}"
+            f"{path}: no topic of images, expected {' or '.join(IMAGE_TYPES)}; {_found(bag)}{_remedy(bag)}"
         )
     image_topic = _only(path, "images", pictures)
-    recorded_ns, t_ns, problems = _image_times(bag, image_topic)
+    recorded_ns, t_ns, more = _image_times(bag, image_topic)
+    problems = [*bag.problems, *more]
     kept = t_ns > np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(t_ns)[:-1]])
     if not kept.all():
         problems.append(f"{path}: {np.sum(~kept)} images are not later than one before them; left out")
@@ -132,18 +138,10 @@ def read_bag(path: Path) -> RecordedFrames:
     return RecordedFrames(frames, t_s, commands, images, tuple(problems), rows=frames)
 
 
-def _is_bag(path: Path) -> bool:
-    if path.suffix.lower() in STORAGE_ENDINGS and is_regular(path):
-        return True
-    return is_regular(path / METADATA_FILE) and any(
-        any(path.glob(f"*{ending}*")) for ending in STORAGE_ENDINGS
-    )
-
-
 FORMAT = DriveFormat(
     kind="bag",
     described=f"a ROS 2 bag ({METADATA_FILE}; {', '.join(STORAGE_ENDINGS)})",
-    recognises=_is_bag,
+    recognises=is_bag,
     read=read_bag,
     files=(
         METADATA_FILE,
@@ -155,7 +153,26 @@ FORMAT = DriveFormat(
 
 
 def _found(bag: Bag) -> str:
-    return "found " + (", ".join(str(topic) for topic in bag.topics) or "no topic at all")
+    """List the topics of a bag, those that could be meant first: a robot has hundreds."""
+    known = {kind.rpartition("/")[2] for kind in (*IMAGE_TYPES, *COMMAND_TYPES)}
+    topics = sorted(bag.topics, key=lambda topic: topic.type.rpartition("/")[2] not in known)
+    more = f" and {len(topics) - _MAX_LISTED} more" if len(topics) > _MAX_LISTED else ""
+    return "found " + (", ".join(map(str, topics[:_MAX_LISTED])) or "no topic at all") + more
+
+
+def _remedy(bag: Bag) -> str:
+    """Say what to do about topics of images that cannot be read; the end of an error."""
+    pictures = [topic for topic in bag.topics if re.search("image|video|packet", topic.type.lower())]
+    if any(topic.encoding == "ros1" for topic in bag.topics):
+        return (
+            "; these are messages of ROS 1: convert the .bag that they came from: "
+            f"rosbags-convert --src {shlex.quote(bag.path.stem)}.bag --dst {shlex.quote(bag.path.stem)}"
+        )
+    if any(re.search("video|packet", topic.type.lower()) for topic in pictures):
+        return f"; {VIDEO_REMEDY}"
+    if others := {topic.encoding for topic in pictures} - {*READABLE}:
+        return f"; images in {', '.join(sorted(others))} are not read: record them in CDR or JSON"
+    return ""
 
 
 def _only(path: Path, what: str, topics: list[Topic]) -> Topic:

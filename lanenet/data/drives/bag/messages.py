@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,12 +18,20 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from lanenet.data.drives.bag.storage import Topic, reading
+from lanenet.data.drives.bag.storage import reading
+from lanenet.data.drives.bag.topic import Topic
 from lanenet.data.files import require
 from lanenet.errors import DriveFormatError
 from lanenet.reading import MAX_PIXELS, decode_image
 
 _NS_PER_S = 1_000_000_000
+#: Names of codecs whose frames cannot be decoded one by one.
+_VIDEO_CODECS = frozenset(("h264", "h265", "hevc", "avc", "av1", "vp8", "vp9", "mpeg4", "theora", "ffmpeg"))
+#: What to do about them.
+VIDEO_REMEDY = (
+    "a video stream has to become single images first: play the bag, have ros2 run image_transport republish "
+    "write it out as 'compressed', and record that topic anew"
+)
 
 IMAGE_TYPES = (
     *("sensor_msgs/msg/Image", "foxglove.RawImage"),
@@ -96,7 +105,7 @@ class Decoder:
             pixels = base64.b64decode(pixels) if isinstance(pixels, str) else bytes(pixels)
             if not self.topic.type.endswith("CompressedImage"):
                 return _raw_image(message, pixels, where)
-        return decode_image(pixels, where, DriveFormatError)
+            return _packed_image(str(message.format).lower(), pixels, where)
 
     def command(self, data: bytes) -> tuple[int, float, float, float]:
         """Return stamp, [ns], speed, [cm/s], steering angle and yaw rate, [rad] and [rad/s], positive left.
@@ -130,6 +139,27 @@ def _typestore() -> Any:
         types |= typesys.get_types_from_msg(text, name)
     store.register(types)
     return store
+
+
+def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, "h w 3"]:
+    """Decode a compressed image.
+
+    Args:
+        form: Its format: image_transport writes ``ENCODING; CODEC compressed STORED``, others the codec.
+        pixels: What was stored: BGR, or RGB taken for BGR, or the mosaic of a Bayer pattern as a gray image.
+        where: Names it in errors.
+    """
+    if named := sorted(_VIDEO_CODECS.intersection(re.split("[^a-z0-9]+", form))):
+        raise DriveFormatError(f"{where}: images in {named[0]!r}, expected JPEG or PNG; {VIDEO_REMEDY}")
+    image = decode_image(pixels, where, DriveFormatError, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint8:
+        image = (image >> 8 if image.dtype == np.uint16 else np.clip(image, 0, 255)).astype(np.uint8)
+    if image.ndim == 2:
+        encoding = re.sub("16$", "8", form.partition(";")[0].strip())
+        code = _ENCODINGS[encoding][1] if encoding in _ENCODINGS and "bayer" in encoding else None
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if code is None else code))
+    image = np.ascontiguousarray(image[..., :3])
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR)) if "compressed rgb" in form else image
 
 
 def _raw_image(message: Any, pixels: bytes, where: object) -> UInt8[np.ndarray, "h w 3"]:

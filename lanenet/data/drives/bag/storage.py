@@ -3,49 +3,37 @@
 from __future__ import annotations
 
 import heapq
-import os
+import re
 import shlex
+import shutil
 import sqlite3
+import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
-from typing import BinaryIO
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
 from urllib.parse import quote
 
-from lanenet.config import read_yaml
-from lanenet.data.files import require
-from lanenet.errors import DriveFormatError, LanenetError, counted
-from lanenet.reading import FolderFiles, first_line, open_regular
+from lanenet.data.drives.bag.mcap_file import open_mcap
+from lanenet.data.drives.bag.topic import MAX_STORAGE, Messages, Topic
+from lanenet.errors import DriveFormatError, LanenetError
+from lanenet.reading import (
+    MAX_JSON,
+    FolderFiles,
+    first_line,
+    is_regular,
+    natural_key,
+    open_regular,
+    read_bytes,
+)
 
 METADATA_FILE = "metadata.yaml"
 #: A storage file in the folder of a bag, or a recording by itself.
 STORAGE_ENDINGS = (".mcap", ".db3")
-#: [B]; chosen: an hour of raw images of a megapixel at 30 frames/s has 0.3 TB.
-_MAX_STORAGE = 2**41
-_MCAP_SIGN = b"\x89MCAP0\r\n"
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a bag.
-
-    Attributes:
-        name: Such as ``/camera/image_raw``.
-        type: Such as ``sensor_msgs/msg/Image``.
-        count: Messages, according to the bag's index.
-        encoding: Of its messages, ``cdr`` or ``json`` for those that can be read.
-    """
-
-    name: str
-    type: str
-    count: int
-    encoding: str
-
-    def __str__(self) -> str:
-        encoding = "" if self.encoding in ("cdr", "json") else f" in {self.encoding}"
-        return f"{self.name} ({self.type}{encoding}, {counted(self.count, 'message')})"
+#: A database that was not closed is copied, with its log, up to this size, [B]; chosen: it goes to the folder
+#: of temporary files, which often lies in memory.
+_MAX_COPIED = 2**31
 
 
 @contextmanager
@@ -74,10 +62,13 @@ class Bag:
             MissingExtraError: If rosbags or mcap is not installed.
         """
         self.path = path
+        #: What is wrong with the bag, a sentence each.
+        self.problems: list[str] = []
         with reading(path), ExitStack() as stack:
+            files, self.problems = _storage_files(path)
             opened = [
-                (_opened_mcap if file.suffix.lower() == ".mcap" else _opened_sqlite)(file, stack)
-                for file in _storage_files(path)
+                (open_mcap if file.suffix.lower() == ".mcap" else _opened_sqlite)(file, stack)
+                for file in files
             ]
             weakref.finalize(self, stack.pop_all().close)
         self._messages = [messages for _, messages in opened]
@@ -98,37 +89,77 @@ class Bag:
             yield from heapq.merge(*streams, key=lambda message: message[0])
 
 
-_Messages = Callable[[str, int | None], Iterator[tuple[int, bytes]]]
+def is_bag(path: Path) -> bool:
+    """Tell whether a path is a bag: a storage file, or a folder with the files of one bag, by their names.
+
+    Several files without metadata are one bag if they are numbered as rosbag2 numbers them; else each is a
+    recording by itself.
+    """
+    if path.suffix.lower() in STORAGE_ENDINGS and is_regular(path):
+        return True
+    files = [file for ending in STORAGE_ENDINGS for file in path.glob(f"*{ending}*")]
+    if is_regular(path / METADATA_FILE):
+        return bool(files)
+    plain = [file for file in files if file.suffix in STORAGE_ENDINGS]
+    return bool(plain) and len({re.sub(r"_[0-9]+$", "", file.stem) for file in plain}) == 1
 
 
-def _storage_files(path: Path) -> list[Path]:
+def _storage_files(path: Path) -> tuple[list[Path], list[str]]:
+    """Return the files of a bag, and what is wrong with its metadata.
+
+    Metadata are written when the recording ends: after a power cut they are missing, empty or old. Of them
+    only the compression counts, which the files do not tell, and which files there should be.
+    """
     if not path.is_dir():
-        return [path]
-    # Their names are enough, and the index of each: what else the metadata say may be out of date.
+        return [path], []
     inside = FolderFiles(path)
-    metadata = read_yaml(inside.file(METADATA_FILE, path, DriveFormatError), DriveFormatError)
-    with reading(path / METADATA_FILE):
-        known = metadata["rosbag2_bagfile_information"]
-        names = [PurePath(name).name for name in known["relative_file_paths"]]
-        compression = known.get("compression_mode")
-    if compression:
+    metadata = inside.file(METADATA_FILE, path, DriveFormatError)
+    text = ""
+    if is_regular(metadata):
+        text = read_bytes(metadata, DriveFormatError, MAX_JSON).decode("utf-8", errors="replace")
+    # By lines, not as YAML: a torn file has its lines, and 180 topics have any number of values.
+    mode = re.search(r"^\s*compression_mode:[ \t'\"]*(\w*)", text, re.MULTILINE)
+    block = re.search(r"^\s*relative_file_paths:[ \t]*\n((?:\s*- .*(?:\n|$))*)", text, re.MULTILINE)
+    listed = re.findall(r"- [\"']?([^\"'\n]+)", block[1] if block else "")
+    names = [PurePosixPath(name.strip().replace("\\", "/")).name for name in listed]
+    there = sorted((file.name for file in path.glob("*") if is_regular(file)), key=natural_key)
+    if mode and mode[1].lower() not in ("", "none"):
+        _refuse_packed(path, mode[1])
+    files = [name for name in there if name.lower().endswith(STORAGE_ENDINGS) and not name.startswith(".")]
+    if not files and any(name.endswith((".zstd", ".zst", ".lz4")) for name in there):
+        _refuse_packed(path, "file")
+    # Those of another storage or another bag in the folder are not the recording's.
+    if listed_files := [name for name in files if name in names]:
+        of_bag = {re.sub(r"_[0-9]+$", "", Path(name).stem) for name in listed_files}
+        files = [n for n in files if n in names or re.sub(r"_[0-9]+$", "", Path(n).stem) in of_bag]
+    problems = []
+    if not names:
+        problems.append(f"{metadata}: names no file (was the recording cut off?); the files there are read")
+    if absent := [name for name in names if name not in there]:
+        problems.append(f"{metadata}: files listed but not there: {', '.join(absent)}")
+    if names and (unlisted := [name for name in files if name not in names]):
+        problems.append(f"{metadata}: does not list {', '.join(unlisted)}, read all the same")
+    if not files:
         raise DriveFormatError(
-            f"{path}: compressed by rosbag2 (mode {compression}), expected none or MCAP's own compression; "
-            f"unpack it: "
-            f"rosbags-convert --src {shlex.quote(str(path))} --dst {shlex.quote(f'{path.name}_unpacked')}"
+            f"{path}: no file that ends in {' or '.join(STORAGE_ENDINGS)}; {'; '.join(problems)}"
         )
-    files = [inside.file(name, path / METADATA_FILE, DriveFormatError) for name in names]
-    for file in files:
-        if file.suffix.lower() not in STORAGE_ENDINGS:
-            raise DriveFormatError(f"{file}: expected a file that ends in {' or '.join(STORAGE_ENDINGS)}")
-    return files
+    return [inside.file(name, metadata, DriveFormatError) for name in files], problems
 
 
-def _opened_sqlite(path: Path, stack: ExitStack) -> tuple[list[Topic], _Messages]:
-    with open_regular(path, DriveFormatError, _MAX_STORAGE):
+def _refuse_packed(path: Path, mode: str) -> None:
+    unpacked = shlex.quote(f"{path.name}_unpacked")
+    raise DriveFormatError(
+        f"{path}: compressed by rosbag2 (mode {mode}), expected none or MCAP's own compression; unpack it: "
+        f"rosbags-convert --src {shlex.quote(str(path))} --dst {unpacked}"
+    )
+
+
+def _opened_sqlite(path: Path, stack: ExitStack) -> tuple[list[Topic], Messages]:
+    with open_regular(path, DriveFormatError, MAX_STORAGE):
         pass
     # Nothing is written beside the file, not even a lock.
-    address = f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1"
+    whole = _whole_database(path, stack)
+    address = f"file:{quote(str(whole.resolve()))}?mode=ro{'&immutable=1' if whole == path else ''}"
     database = stack.enter_context(closing(sqlite3.connect(address, uri=True, check_same_thread=False)))
     # Not views, which may be queries without an end.
     tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
@@ -151,51 +182,27 @@ def _opened_sqlite(path: Path, stack: ExitStack) -> tuple[list[Topic], _Messages
     return topics, messages
 
 
-class _BoundedReads:
-    """A file of which never more than its size is asked: Python allocates what a damaged length says."""
-
-    def __init__(self, stream: BinaryIO, size: int) -> None:
-        self._stream = stream
-        self._size = size
-        self.seek, self.tell = stream.seek, stream.tell
-
-    def read(self, length: int = -1) -> bytes:
-        """Read up to a number of bytes, or all."""
-        return self._stream.read(min(length, self._size))
+def _log_of(path: Path) -> Path:
+    """Return where SQLite keeps the newest messages of a bag that was not closed."""
+    return path.with_name(f"{path.name}-wal")
 
 
-def _opened_mcap(path: Path, stack: ExitStack) -> tuple[list[Topic], _Messages]:
-    # Not by rosbags: it refuses files without ROS's profile, as Foxglove and others write them.
-    library = require("mcap.reader", "bags")
-    stream = stack.enter_context(open_regular(path, DriveFormatError, _MAX_STORAGE))
-    start = stream.read(len(_MCAP_SIGN))
-    size = stream.seek(0, os.SEEK_END)
-    stream.seek(max(0, size - len(_MCAP_SIGN)))
-    whole = stream.read() == _MCAP_SIGN
-    stream.seek(0)
-    if start != _MCAP_SIGN:
-        raise DriveFormatError(f"{path}: not an MCAP file (it begins with {start!r})")
-    # No record is longer than the file, whatever its length says.
-    reader = library.SeekingReader(_BoundedReads(stream, size), record_size_limit=size)
-    summary = reader.get_summary() if whole else None
-    if summary is None or summary.statistics is None:
+def _whole_database(path: Path, stack: ExitStack) -> Path:
+    """Return a database that has its newest rows: a copy of one that was not closed, with its log.
+
+    Raises:
+        DriveFormatError: If it is too large to be copied; says how to close it.
+    """
+    log = _log_of(path)
+    if not is_regular(log) or log.stat().st_size == 0:
+        return path
+    if path.stat().st_size + log.stat().st_size > _MAX_COPIED:
+        close = f"import sqlite3; sqlite3.connect('{path.name}').execute('PRAGMA wal_checkpoint(TRUNCATE)')"
         raise DriveFormatError(
-            f"{path}: has no index at its end (was the recording cut off?); mend it with Foxglove's tool: "
-            "mcap recover"
+            f"{path}: was not closed, its newest messages lie in {log.name}; close it in its folder: "
+            f"python -c {shlex.quote(close)}"
         )
-    counts = summary.statistics.channel_message_counts
-    topics = [
-        Topic(
-            channel.topic,
-            schema.name if (schema := summary.schemas.get(channel.schema_id)) is not None else "no schema",
-            counts.get(channel.id, 0),
-            channel.message_encoding,
-        )
-        for channel in summary.channels.values()
-    ]
-
-    def messages(topic: str, from_ns: int | None) -> Iterator[tuple[int, bytes]]:
-        for _, _, message in reader.iter_messages([topic], starting_at=from_ns):
-            yield message.log_time, message.data
-
-    return topics, messages
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lanenet-bag-")))
+    for file in (path, log):
+        shutil.copyfile(file, folder / file.name)
+    return folder / path.name

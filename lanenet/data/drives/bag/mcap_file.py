@@ -1,0 +1,197 @@
+"""MCAP files: their topics, and their messages in the order of time, with a bound on what is unpacked.
+
+The records are parsed by the library ``mcap``, the chunks are unpacked and walked through here: the library
+unpacks whatever a chunk claims, keeps every chunk that overlaps another in time, and makes an object of every
+message of every topic. Source: MCAP specification, version 0.
+"""
+
+from __future__ import annotations
+
+import heapq
+import io
+import os
+import struct
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from lanenet.data.drives.bag.topic import MAX_STORAGE, Messages, Topic
+from lanenet.data.files import require
+from lanenet.errors import DriveFormatError
+from lanenet.reading import MEBIBYTE, most_unpacked, open_regular
+
+_SIGN = b"\x89MCAP0\r\n"
+#: Of a chunk, unpacked. Chosen: writers begin a new one after a megabyte, or after one message that is
+#: larger, and an image of 20 megapixels without loss has 60 MB.
+_MAX_CHUNK = 64 * MEBIBYTE
+#: Messages that wait, since a later chunk may hold earlier ones. Chosen: writers' chunks overlap by a few.
+_MAX_WAITING = 96 * MEBIBYTE
+#: A message takes at least so many bytes of the file. Chosen: its entry in the index of its chunk has 16, and
+#: recorders that leave that out pack the stamps of a steady message to three.
+_LEAST_PACKED = 2
+#: Messages that any file may hold.
+_ANY_MESSAGES = 100_000
+#: Opcode of a message; opcode and length of a record; channel, sequence, log and publish time of a message.
+_MESSAGE, _RECORD, _HEAD = 5, struct.Struct("<BQ"), struct.Struct("<HIQQ")
+
+
+class _BoundedReads:
+    """A file of which never more than its size is asked: Python allocates what a damaged length says."""
+
+    def __init__(self, stream: BinaryIO, size: int) -> None:
+        self._stream = stream
+        self._size = size
+        self.seek, self.tell = stream.seek, stream.tell
+
+    def read(self, length: int = -1) -> bytes:
+        """Read up to a number of bytes, or all."""
+        return self._stream.read(min(length, self._size))
+
+
+def open_mcap(path: Path, stack: ExitStack) -> tuple[list[Topic], Messages]:
+    """Open an MCAP file; returns its topics, and what reads their messages.
+
+    Raises:
+        DriveFormatError: If it is no MCAP file, has no index, or stands for more than it may.
+        MissingExtraError: If mcap is not installed.
+    """
+    # Not by rosbags: it refuses files without ROS's profile, as Foxglove and others write them.
+    library = require("mcap.reader", "bags")
+    stream = stack.enter_context(open_regular(path, DriveFormatError, MAX_STORAGE))
+    start = stream.read(len(_SIGN))
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(max(0, size - len(_SIGN)))
+    whole = stream.read() == _SIGN
+    stream.seek(0)
+    if start != _SIGN:
+        raise DriveFormatError(f"{path}: not an MCAP file (it begins with {start!r})")
+    bounded = _BoundedReads(stream, size)
+    # No record is longer than the file, whatever its length says.
+    summary = library.SeekingReader(bounded, record_size_limit=size).get_summary() if whole else None
+    if summary is None or summary.statistics is None:
+        raise DriveFormatError(
+            f"{path}: has no index at its end (was the recording cut off?); mend it with Foxglove's tool: "
+            "mcap recover"
+        )
+    counts = summary.statistics.channel_message_counts
+    topics = [
+        Topic(
+            channel.topic,
+            schema.name if (schema := summary.schemas.get(channel.schema_id)) is not None else "no schema",
+            counts.get(channel.id, 0),
+            channel.message_encoding,
+        )
+        for channel in summary.channels.values()
+    ]
+    return topics, _McapMessages(path, bounded, size, summary)
+
+
+@dataclass(frozen=True)
+class _McapMessages:
+    path: Path
+    stream: Any
+    size: int
+    summary: Any
+
+    def __call__(self, topic: str, from_ns: int | None) -> Iterator[tuple[int, bytes]]:
+        """Yield time of recording, [ns], and bytes of a topic's messages, in the order of time."""
+        channels = {channel.id for channel in self.summary.channels.values() if channel.topic == topic}
+        since = 0 if from_ns is None else from_ns
+        left = _ANY_MESSAGES + self.size // _LEAST_PACKED
+        waiting: list[tuple[int, int, bytes]] = []
+        held = order = 0
+        for first_ns, records in self._chunks(channels, since):
+            while waiting and waiting[0][0] < first_ns:
+                t_ns, _, data = heapq.heappop(waiting)
+                held -= len(data)
+                yield t_ns, data
+            for number, t_ns, content in _messages_in(records):
+                left -= 1
+                if left < 0:
+                    self._refuse("has more messages than its size can hold")
+                if number in channels and t_ns >= since:
+                    heapq.heappush(waiting, (t_ns, order, bytes(content)))
+                    order, held = order + 1, held + len(content)
+                if held > _MAX_WAITING:
+                    self._refuse("its chunks are not in the order of time; sort it: mcap sort")
+        while waiting:
+            t_ns, _, data = heapq.heappop(waiting)
+            yield t_ns, data
+
+    def _chunks(self, channels: set[int], since_ns: int) -> Iterator[tuple[int, bytes]]:
+        """Yield the first time and the unpacked records of each chunk with such channels since a time."""
+        records = require("mcap.records", "bags")
+        stream_of = require("mcap.data_stream", "bags").ReadDataStream
+        most = most_unpacked(self.size)
+        indexes = sorted(self.summary.chunk_indexes, key=lambda index: index.message_start_time)
+        if not indexes:
+            yield from self._records_in_order(most)
+            return
+        # Before anything is unpacked: a file may name one chunk any number of times.
+        if (claimed := sum(index.uncompressed_size for index in indexes)) > most:
+            self._refuse_size(claimed, most)
+        for index in indexes:
+            # Recorders may leave out which channels a chunk has.
+            has = not index.message_index_offsets or not channels.isdisjoint(index.message_index_offsets)
+            if has and index.message_end_time >= since_ns:
+                self.stream.seek(index.chunk_start_offset + _RECORD.size)
+                chunk = records.Chunk.read(stream_of(self.stream))
+                yield index.message_start_time, self._unpacked(chunk, index.uncompressed_size)
+
+    def _records_in_order(self, most: int) -> Iterator[tuple[int, bytes]]:
+        """Yield the records of a file without an index of chunks; all could be the first in time."""
+        reader = require("mcap.stream_reader", "bags")
+        self.stream.seek(0)
+        for record in reader.StreamReader(self.stream, emit_chunks=True, record_size_limit=self.size).records:
+            data = b""
+            if type(record).__name__ == "Chunk":
+                data = self._unpacked(record, record.uncompressed_size)
+            elif type(record).__name__ == "Message":
+                head = _HEAD.pack(record.channel_id, record.sequence, record.log_time, record.publish_time)
+                data = _RECORD.pack(_MESSAGE, len(head) + len(record.data)) + head + record.data
+            if (most := most - len(data)) < 0:
+                self._refuse_size(most_unpacked(self.size) - most, most_unpacked(self.size))
+            if data:
+                yield 0, data
+
+    def _unpacked(self, chunk: Any, size: int) -> bytes:
+        """Unpack a chunk to the size that the index names, and no further."""
+        if size > _MAX_CHUNK:
+            self._refuse_size(size, _MAX_CHUNK)
+        if not chunk.compression:
+            data = chunk.data
+        elif chunk.compression == "zstd":
+            unpacker = require("zstandard", "bags").ZstdDecompressor(max_window_size=_MAX_CHUNK)
+            data = unpacker.stream_reader(io.BytesIO(chunk.data)).read(size + 1)
+        elif chunk.compression == "lz4":
+            data = require("lz4.frame", "bags").LZ4FrameDecompressor().decompress(chunk.data, size + 1)
+        else:
+            self._refuse(f"has chunks packed by {chunk.compression!r}, expected zstd or lz4")
+        if len(data) != size:
+            self._refuse(f"a chunk of {size} bytes unpacks to {'more' if len(data) > size else len(data)}")
+        return data
+
+    def _refuse_size(self, found: int, most: int) -> None:
+        self._refuse(
+            f"{self.size / MEBIBYTE:.1f} MB stand for {found / MEBIBYTE:.0f} MB, expected at most "
+            f"{most / MEBIBYTE:.0f} MB"
+        )
+
+    def _refuse(self, why: str) -> None:
+        raise DriveFormatError(f"{self.path}: {why}")
+
+
+def _messages_in(records: bytes) -> Iterator[tuple[int, int, memoryview]]:
+    """Yield channel, time of recording, [ns], and content of each message among the records of a chunk."""
+    view, at = memoryview(records), 0
+    while at < len(records):
+        opcode, length = _RECORD.unpack_from(records, at)
+        at += _RECORD.size
+        if length > len(records) - at:
+            raise ValueError(f"a record of {length} bytes ends behind its chunk")
+        if opcode == _MESSAGE:
+            channel, _, t_ns, _ = _HEAD.unpack_from(records, at)
+            yield channel, t_ns, view[at + _HEAD.size : at + length]
+        at += length
