@@ -1,4 +1,4 @@
-"""The package in Python: a network as a function of an image, and three commands as functions.
+"""The package in Python: a network as a function of an image, and four commands as functions.
 
 Each calls what its command calls. Imports stand in the functions, so that ``import lanenet`` costs nothing:
 the car has neither torch nor numba.
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from datagen.pipeline import MapSettings, Report
     from lanenet.config import Settings, SettingsT
+    from lanenet.evaluation.detect import DetectReport
     from lanenet.geometry.camera import Camera
     from lanenet.perception.network.detector import NetworkDetector
 
@@ -179,20 +180,37 @@ def label(
 
 
 def train(
-    config: Settings | Mapping[str, Any] | str | Path,
+    source: Settings | Mapping[str, Any] | str | Path | Sequence[str | Path],
     *overrides: str,
+    name: str | None = None,
+    lane_width_cm: int | float | None = None,
+    camera: str | Path | None = None,
+    wheelbase_cm: int | float | None = None,
+    camera_height_cm: int | float | None = None,
+    tape_width_cm: int | float | None = None,
+    frames: tuple[int, int] | None = None,
     marking_cm: int | float | None = None,
     force: bool = False,
 ) -> Path:
-    """Make the drives, maps and labels that a config needs, train, evaluate and export, as ``lanenet train``.
+    """Train on one's own drives, or do all that a config needs, as ``lanenet train``.
 
-    Shows its progress on stderr and prints verdicts and a table. What is there already is used, and a run
-    that was interrupted resumes. Starts processes, so a script calls it below ``if __name__ == "__main__":``,
-    as Python's ``multiprocessing`` asks for. Needs ``lanenet[train]``.
+    Makes the maps and labels that are needed, trains, evaluates and exports. Shows its progress on stderr
+    and prints verdicts and a table. What is there already is used, and a run that was interrupted resumes.
+    Starts processes, so a script calls it below ``if __name__ == "__main__":``, as Python's
+    ``multiprocessing`` asks for. Needs ``lanenet[train]``.
 
     Args:
-        config: Settings of the run or their file, as ``configs/finetune.yaml``.
-        overrides: Settings that replace those of the config, as ``learn.epochs=5``.
+        source: Drive, tub or video, a folder of them, a map, a label set, or several of these; or a config:
+            its file (``.yaml``), as ``configs/finetune.yaml``, or its settings.
+        overrides: Settings that replace those of the config, given or made, as ``learn.epochs=5``.
+        name: Of the network of one's own drives, which is written to ``checkpoints/NAME``. A config has a key
+            for this and the next six.
+        lane_width_cm: Between the middles of the lane's two lines, for a drive that is to be mapped.
+        camera: Camera file, or an earlier map of the same car.
+        wheelbase_cm: Distance between the car's axles.
+        camera_height_cm: Height of the lens above the road.
+        tape_width_cm: Width of the tape: checks the lane width.
+        frames: First and last number of the frames to map; None for all of them.
         marking_cm: Width of the tape for the detectors that it is compared with.
         force: Replace a network of that name that was trained on other drives, too.
 
@@ -200,16 +218,120 @@ def train(
         The checkpoint's folder, which :func:`load` opens.
 
     Raises:
-        ConfigError: If a setting is wrong.
+        ConfigError: If a setting is wrong, the name or a lane width is missing, or a config is given with
+            what it has keys for.
         LanenetError: If a drive cannot be mapped or its map was rejected, or if the checkpoint was trained
             on other drives or is being written by another run.
     """
     from lanenet.cli import train as command
     from lanenet.cli.shared.options import held_to_the_end
+    from lanenet.cli.shared.own_drive import Measured, is_config
+    from lanenet.errors import ConfigError
+    from lanenet.geometry.lane import check_lane_width
 
-    settings = _settings(command.run_settings_schema(), config, overrides)
+    width_cm = _float(lane_width_cm)
+    if width_cm is not None:
+        check_lane_width(width_cm)
+    measured = Measured(
+        width_cm,
+        None if camera is None else Path(camera),
+        _float(wheelbase_cm),
+        _float(camera_height_cm),
+        _float(tape_width_cm),
+        frames,
+    )
+    paths = _paths(source)
     with held_to_the_end():
+        if paths is None or is_config(paths[0]):
+            given = [*([] if name is None else ["name"]), *measured.given]
+            if given:
+                raise ConfigError(f"{given[0]}=...: is for drives, but a config has a key for it")
+            config = source if paths is None else paths[0]
+            settings = _settings(command.run_settings_schema(), config, overrides)  # type: ignore[arg-type]
+        elif name is None:
+            raise ConfigError(
+                f"expected a name for the network, as in lanenet.train({str(paths[0])!r}, "
+                f"name={paths[0].resolve().stem!r})"
+            )
+        else:
+            settings = command.own_settings(name, paths, measured, overrides, force)
         return command.train_run(settings, _float(marking_cm), force)
+
+
+def detect(
+    source: str | Path,
+    out: str | Path,
+    *,
+    model: str | Path | None = None,
+    detector: str | None = None,
+    camera: str | Path | None = None,
+    video: str | Path | None = None,
+    lane_width_cm: int | float | None = None,
+    marking_cm: int | float | None = None,
+    any_camera: bool = False,
+    frames: tuple[int, int] | None = None,
+    skip_unreadable: bool = False,
+    config: str | Path | None = None,
+    mask: str | Path | None = None,
+) -> DetectReport:
+    """Run a detector over a photo, a video, a drive or a tub, and write what it finds, as ``lanenet detect``.
+
+    Shows its progress on stderr. :func:`load` gives a network as a function of one image.
+
+    Args:
+        source: Photo, folder of photos, video, drive, tub, or a map of one.
+        out: Table to write (``.parquet`` or ``.csv``).
+        model: Checkpoint folder or ONNX file of a network, or ``hf:owner/name``.
+        detector: ``network``, ``lane-filter``, ``hough`` or ``painter``; a model alone means the network.
+        camera: Camera file, or a map of the same car; None takes that of the drive or map.
+        video: Annotated video to write (``.mp4``).
+        lane_width_cm: Between the middles of the lane's two lines; None takes the drive's.
+        marking_cm: Width of the tape.
+        any_camera: Accept a camera that the model was not trained with.
+        frames: First and last number of the frames; None for all of them.
+        skip_unreadable: Give a frame that cannot be read an empty row.
+        config: File with the settings of the detector.
+        mask: ``auto``, or a PNG that is black except on the car itself.
+
+    Returns:
+        Counts, timings and problems; the table is read with
+        :func:`lanenet.data.detections.read_detections`.
+
+    Raises:
+        LanenetError: If the source, the model or the camera cannot be used, or an output cannot be written.
+    """
+    from lanenet.cli import detect as command
+    from lanenet.cli.shared.options import held_to_the_end
+    from lanenet.data.hub import pulled
+    from lanenet.geometry.lane import check_lane_width
+
+    width_cm = _float(lane_width_cm)
+    if width_cm is not None:
+        check_lane_width(width_cm)
+    asked = command.Asked(
+        Path(source),
+        Path(out),
+        model=None if model is None else pulled(model),
+        detector=detector,
+        camera=None if camera is None else Path(camera),
+        video=None if video is None else Path(video),
+        lane_width_cm=width_cm,
+        marking_cm=_float(marking_cm),
+        any_camera=any_camera,
+        frames=frames,
+        skip_unreadable=skip_unreadable,
+        config=None if config is None else Path(config),
+        mask=None if mask is None else str(mask),
+    )
+    with held_to_the_end():
+        return command.detect_lanes(asked)[0]
+
+
+def _paths(source: object) -> list[Path] | None:
+    """Return the paths of drives, or of a config; None for the settings of a config."""
+    if isinstance(source, str | Path):
+        return [Path(source)]
+    return [Path(path) for path in source] if isinstance(source, list | tuple) and source else None
 
 
 def _float(value: int | float | None) -> float | None:

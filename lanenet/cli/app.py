@@ -14,7 +14,20 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from lanenet.cli import calibrate, detect, drives, export, join, label, label_all, map, sweep, train, val
+from lanenet.cli import (
+    calibrate,
+    detect,
+    drives,
+    export,
+    join,
+    label,
+    label_all,
+    map,
+    settings,
+    sweep,
+    train,
+    val,
+)
 from lanenet.cli.car import analyse, bench, doctor, drive, stop
 from lanenet.cli.research import judge, localise, reality, simulate, worlds
 from lanenet.cli.shared import console, standing
@@ -25,6 +38,7 @@ _VERBS = {
     "Your own drive": (map, join, label, train, val, detect, calibrate),
     "On the car": (doctor, bench, drive, stop, export),
     "Many drives": (drives, label_all),
+    "Help": (settings,),
     "Research": (simulate, sweep, judge, worlds, reality, localise, analyse),
 }
 #: The extra that brings a package, for the message when the package is missing.

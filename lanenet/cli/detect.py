@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +22,7 @@ from lanenet.cli.shared.options import (
     lane_cm,
     lock_outputs,
 )
+from lanenet.cli.shared.standing import next_on_car
 from lanenet.cli.shared.viewing import NO_VIEWS, Views, with_viewers
 from lanenet.config import read_yaml
 from lanenet.errors import CalibrationError, DriveFormatError, counted
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from jaxtyping import UInt8
 
     from lanenet.data.drives.sources import Source
-    from lanenet.evaluation.detect import SeenFrame
+    from lanenet.evaluation.detect import DetectReport, SeenFrame
     from lanenet.geometry.camera import Camera
     from lanenet.perception.estimate import Detector
     from lanenet.viewers.mapped import MapToSee
@@ -107,61 +108,23 @@ def detect(
     views: Views = NO_VIEWS,
 ) -> None:
     """Run a detector over a photo, a video, a drive or a tub."""
-    from lanenet.data.camera_file import read_camera
-    from lanenet.data.detections import check_table_path
-    from lanenet.data.drives.sources import check_size
-    from lanenet.evaluation.detect import run_detector
-
-    name = detector_for(detector, model)
-    check_not_source(source, out, video)
-    lock_outputs(out, video)
-    views.check(source)
-    check_table_path(out)
-    whole, of_map = _open(source, out, video)
-    camera = camera or of_map
-    opened = whole if frames is None else whole.numbered(*frame_range(frames))
-    used_camera = read_camera(camera) if camera is not None else opened.camera
-    if used_camera is not None:
-        check_size(opened, used_camera, camera or source)
-    elif kind_of(name).needs_camera:
-        raise CalibrationError(
-            f"{source}: has no camera, expected --camera with a camera file or a map; {opened.way_to_camera}"
-        )
-    inputs = DetectorInputs(
-        camera=used_camera,
+    numbers = None if frames is None else frame_range(frames)
+    asked = Asked(
+        source,
+        out,
         model=model,
-        any_camera=any_camera,
+        detector=detector,
+        camera=camera,
+        video=video,
         lane_width_cm=lane_width,
-        drive_lane_width_cm=opened.lane_width_cm,
         marking_cm=marking,
-        mask=_mask_of(mask, whole, name),
+        any_camera=any_camera,
+        frames=numbers,
+        skip_unreadable=skip_unreadable,
         config=config,
+        mask=mask,
     )
-    chosen = build_detector(name, inputs)
-    console.show_problems(getattr(chosen, "problems", ()))
-    with ExitStack() as stack:
-        watch = (
-            _watch(views, stack, opened, chosen, used_camera, _map_of(camera, Path(opened.name)))
-            if views
-            else None
-        )
-        progress = stack.enter_context(console.progress_bar(f"detect ({name})"))
-        try:
-            report = run_detector(
-                opened,
-                chosen,
-                used_camera,
-                out,
-                video,
-                progress,
-                skip_unreadable=skip_unreadable,
-                watch=watch,
-            )
-        except DriveFormatError as error:
-            way_on = (
-                "" if skip_unreadable else "; --skip-unreadable leaves such frames out, with an empty row"
-            )
-            raise DriveFormatError(f"{error}{way_on}") from None
+    report, chosen = detect_lanes(asked, views)
     console.show_problems(report.problems)
     console.say(
         f"{counted(report.frames, 'frame')}, {report.complete} with all six points, {report.steered} with a "
@@ -190,7 +153,101 @@ def detect(
         }
         console.next_command("detect", source, *console.given(again))
     else:
-        console.next_command("bench", *console.given({"--model": model, "--camera": camera}))
+        next_on_car()
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a run of a detector is asked for: the options of ``lanenet detect``.
+
+    Attributes:
+        source: Photo, folder of photos, video, drive, tub, or a map of one.
+        out: Table to write.
+        model, detector, camera, video, marking_cm, any_camera, skip_unreadable, config, mask: As there.
+        lane_width_cm: Between the middles of the lane's two lines.
+        frames: First and last number of the frames; None for all.
+    """
+
+    source: Path
+    out: Path
+    model: Path | None = None
+    detector: str | None = None
+    camera: Path | None = None
+    video: Path | None = None
+    lane_width_cm: float | None = None
+    marking_cm: float | None = None
+    any_camera: bool = False
+    frames: tuple[int, int] | None = None
+    skip_unreadable: bool = False
+    config: Path | None = None
+    mask: str | None = None
+
+
+def detect_lanes(asked: Asked, views: Views = NO_VIEWS) -> tuple[DetectReport, Detector]:
+    """Run a detector as the command does, with its progress and without its words; also returns the detector.
+
+    Raises:
+        LanenetError: If the source, the model or the camera cannot be used, or an output cannot be written.
+    """
+    from lanenet.data.camera_file import read_camera
+    from lanenet.data.detections import check_table_path
+    from lanenet.data.drives.sources import check_size
+    from lanenet.evaluation.detect import run_detector
+
+    name = detector_for(asked.detector, asked.model)
+    source, out, video = asked.source, asked.out, asked.video
+    check_not_source(source, out, video)
+    lock_outputs(out, video)
+    views.check(source)
+    check_table_path(out)
+    whole, of_map = _open(source, out, video)
+    camera = asked.camera or of_map
+    opened = whole if asked.frames is None else whole.numbered(*asked.frames)
+    used_camera = read_camera(camera) if camera is not None else opened.camera
+    if used_camera is not None:
+        check_size(opened, used_camera, camera or source)
+    elif kind_of(name).needs_camera:
+        raise CalibrationError(
+            f"{source}: has no camera, expected --camera with a camera file or a map; {opened.way_to_camera}"
+        )
+    inputs = DetectorInputs(
+        camera=used_camera,
+        model=asked.model,
+        any_camera=asked.any_camera,
+        lane_width_cm=asked.lane_width_cm,
+        drive_lane_width_cm=opened.lane_width_cm,
+        marking_cm=asked.marking_cm,
+        mask=_mask_of(asked.mask, whole, name),
+        config=asked.config,
+    )
+    chosen = build_detector(name, inputs)
+    console.show_problems(getattr(chosen, "problems", ()))
+    with ExitStack() as stack:
+        watch = (
+            _watch(views, stack, opened, chosen, used_camera, _map_of(camera, Path(opened.name)))
+            if views
+            else None
+        )
+        progress = stack.enter_context(console.progress_bar(f"detect ({name})"))
+        try:
+            report = run_detector(
+                opened,
+                chosen,
+                used_camera,
+                out,
+                video,
+                progress,
+                skip_unreadable=asked.skip_unreadable,
+                watch=watch,
+            )
+        except DriveFormatError as error:
+            way_on = (
+                ""
+                if asked.skip_unreadable
+                else "; --skip-unreadable leaves such frames out, with an empty row"
+            )
+            raise DriveFormatError(f"{error}{way_on}") from None
+    return report, chosen
 
 
 def _open(source: Path, *outs: Path | None) -> tuple[Source, Path | None]:

@@ -10,6 +10,7 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import check_ending, check_not_source, lock_outputs
+from lanenet.cli.shared.standing import next_on_car
 from lanenet.errors import ConfigError, counted
 
 #: Those of lanenet.data.exports, which needs more than the car has.
@@ -142,4 +143,4 @@ def _export_model(checkpoint: Path, out: Path | None, check: list[Path], int8: b
         path, rasters, difference = export_checkpoint(checkpoint, out, check)
         console.say(f"onnxruntime and PyTorch differ by {difference:.1g} cm at most, on {rasters} rasters")
         console.wrote(path)
-    console.next_command("bench", "--model", path)
+    next_on_car()

@@ -37,6 +37,7 @@ from lanenet.cli.shared.own_drive import (
     parts_of,
 )
 from lanenet.cli.shared.stages import Stages, stopped_in
+from lanenet.cli.shared.standing import next_on_car
 from lanenet.config import Settings, check_settings, dump_settings, load_settings, to_yaml
 from lanenet.data.files import write_text
 from lanenet.errors import CheckpointError, ConfigError, counted
@@ -159,11 +160,26 @@ def train(
         )
     if name is None:
         raise ConfigError(f"expected a name for the network, as in --name {paths[0].resolve().stem}")
+    train_run(own_settings(name, paths, measured, overrides, force), marking, force, show_all)
+
+
+def own_settings(
+    name: str, paths: Sequence[Path], measured: Measured, overrides: Sequence[str], force: bool
+) -> Any:
+    """Choose the settings of a training on one's own drives, and write them down as a config.
+
+    The arguments are those of :func:`lanenet.cli.shared.own_drive.own_config`; ``force`` replaces a network
+    or a config of other drives.
+
+    Raises:
+        LanenetError: As :func:`own_config` and :func:`check_taken`.
+    """
     plain = own_config(name, paths, measured, overrides, Path("runs"))
-    settings = check_settings(run_settings_schema(), plain, shlex.join(["lanenet", "train", *sources]))
+    words = shlex.join(["lanenet", "train", *map(str, paths), *overrides])
+    settings = check_settings(run_settings_schema(), plain, words)
     check_taken(settings, force)
     _write_config(plain, settings)
-    train_run(settings, marking, force, show_all)
+    return settings
 
 
 def _write_config(plain: dict[str, Any], settings: Any) -> None:
@@ -499,18 +515,12 @@ class _Run:
             console.wrote(report.out, report.video)
 
     def _say_next(self, data: PreparedData) -> None:
-        from lanenet.evaluation.sources import Opened
-
+        if self.jobs or data.example is None:
+            next_on_car()
+            return
         camera = self.checkpoint / "camera.yaml" if data.camera is not None else None
-        source, width_cm = Path("SOURCE"), None
-        mapped = next((job for job in self.jobs if not job.is_labels), None)
-        if mapped is not None:
-            source, width_cm = Opened(mapped.frames).drive, f"{mapped.recording.lane_width_cm:g}"
-            # With synthetic drives the checkpoint's own camera may be that of its example.
-            camera = mapped.frames / "camera.yaml" if camera is None or data.example is not None else camera
-        elif data.example is not None:
-            source = self.checkpoint / f"example{data.example.suffix}"
-        options = {"--model": self.checkpoint, "--camera": camera, "--lane-width": width_cm}
+        source = self.checkpoint / f"example{data.example.suffix}"
+        options = {"--model": self.checkpoint, "--camera": camera}
         console.next_command("detect", source, *console.given(options), "--out", "runs/lanes.csv")
 
 

@@ -18,6 +18,7 @@ from lanenet.cli.shared.options import (
     path_or_hub,
 )
 from lanenet.cli.shared.own_drive import learned_from
+from lanenet.cli.shared.standing import next_on_car
 from lanenet.cli.shared.viewing import NO_VIEWS, Views, view_answers, with_viewers
 from lanenet.errors import ConfigError
 from lanenet.evaluation.comparison import SeenSource, default_names, evaluate
@@ -153,7 +154,11 @@ def val(
     shown = "network" if "network" in names else best
     if alone:
         console.say("the other detectors and more tables: --all" if out is None else "all tables: --all")
-    console.next_command(*_next_words(sources, shown, networks.get(shown), marking, any_camera))
+    words = _next_words(sources, shown, networks.get(shown), marking, any_camera)
+    if words:
+        console.next_command(*words)
+    else:
+        next_on_car()
 
 
 def show(
@@ -198,10 +203,13 @@ def _where(sources: Sequence[Opened], model: Path | None) -> str:
 def _next_words(
     sources: Sequence[Opened], shown: str, model: Path | None, marking: float | None, any_camera: bool
 ) -> list[str | Path]:
-    """A command that runs as it stands: the lanes that a detector finds in the first source with frames."""
+    """A command that runs as it stands: the lanes that a detector finds in the first source with frames.
+
+    Empty if no source has frames.
+    """
     with_frames = [source for source in sources if source.frames is not None]
     if not with_frames:
-        return ["bench", *console.given({"--model": model})]
+        return []
     source, detector = with_frames[0], kind_of("network" if model is not None else shown)
     is_map = source.drive != source.path
     options = {

@@ -13,10 +13,13 @@ from typing import Any, assert_type
 import cv2
 import numpy as np
 import pytest
+from drives import write_drive  # type: ignore[import-not-found]
+from typer.testing import CliRunner
 
 import lanenet
 from datagen.pipeline import MapRequest, MapSettings
 from lanenet.cli import train as train_command
+from lanenet.cli.app import app
 from lanenet.data.camera_file import read_camera
 from lanenet.errors import CalibrationError, ConfigError, LanenetError, ModelMismatchError
 from lanenet.perception.estimate import DetectorInputs, LaneEstimate
@@ -139,19 +142,69 @@ def test_train_takes_a_config_as_a_file_or_as_values(monkeypatch: pytest.MonkeyP
         lanenet.train({"nmae": "mine"})
 
 
+def test_train_takes_a_drive_as_the_command_does(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[Any] = []
+
+    def train_run(settings: Any, *_: object) -> Path:
+        asked.append(settings)
+        return Path("c")
+
+    monkeypatch.setattr(train_command, "train_run", train_run)
+    monkeypatch.chdir(tmp_path)
+    drive = write_drive(tmp_path / "tub", 90)
+    assert lanenet.train("tub", "learn.epochs=5", lane_width_cm=50, name="x", wheelbase_cm=17) == Path("c")
+    (known,) = asked[0].data.drives
+    assert (known.path, known.lane_width_cm, known.wheelbase_cm) == (drive.resolve(), 50.0, 17.0)
+    assert asked[0].name == "x" and asked[0].learn.epochs == 5
+    # Written down as the command writes it.
+    words = ["train", "tub", "learn.epochs=5", "--lane-width", "50", "--name", "x", "--wheelbase", "17"]
+    written = Path("runs/x/x.yaml").read_text()
+    assert CliRunner().invoke(app, words).exit_code == 0
+    assert asked[1] == asked[0] and Path("runs/x/x.yaml").read_text() == written
+    write_drive(tmp_path / "tub2", 90)
+    lanenet.train(["tub", Path("tub2")], lane_width_cm=50, name="both")
+    assert [each.path.name for each in asked[2].data.drives] == ["tub", "tub2"]
+    with pytest.raises(ConfigError, match=r"expected a name .*lanenet\.train\('tub', name='tub'\)"):
+        lanenet.train("tub", lane_width_cm=50)
+    with pytest.raises(ConfigError, match=r"0\.5 m are 50 cm"):
+        lanenet.train("tub", lane_width_cm=0.5, name="x")
+    wrong: tuple[dict[str, Any], ...] = ({"name": "y"}, {"lane_width_cm": 40})
+    for given in wrong:
+        with pytest.raises(ConfigError, match=f"{next(iter(given))}=.*a config has a key"):
+            lanenet.train("runs/x/x.yaml", **given)
+
+
+def test_detect_writes_what_the_command_writes(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    shutil.copy(GENERAL / "example.jpg", tmp_path / "photos")
+    options: dict[str, Any] = {"model": GENERAL, "camera": GENERAL / "camera.yaml", "lane_width_cm": 40}
+    report = lanenet.detect(tmp_path / "photos", tmp_path / "own.csv", **options)
+    assert (report.frames, report.complete, report.out) == (1, 1, tmp_path / "own.csv")
+    words = [f"--{name.removesuffix('_cm').replace('_', '-')}={value}" for name, value in options.items()]
+    result = CliRunner().invoke(
+        app, ["detect", str(tmp_path / "photos"), f"--out={tmp_path / 'c.csv'}", *words]
+    )
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "own.csv").read_bytes() == (tmp_path / "c.csv").read_bytes()
+    with pytest.raises(LanenetError, match="no detector was named"):
+        lanenet.detect(tmp_path / "photos", tmp_path / "own.csv")
+    with pytest.raises(LanenetError, match="ends in"):
+        lanenet.detect(tmp_path / "photos", tmp_path / "own.csv", video=tmp_path / "v.txt", **options)
+
+
 def test_the_page_calls_what_exists() -> None:
     blocks = re.findall(
         r"```python\n(.*?)```", (CHECKPOINTS.parent / "docs/python.md").read_text(), re.DOTALL
     )
     calls = [node for block in blocks for node in ast.walk(ast.parse(block)) if isinstance(node, ast.Call)]
-    called = {node.func.attr: node for node in calls if isinstance(node.func, ast.Attribute)}
-    assert called.keys() == set(lanenet.__all__)
-    for name, call in called.items():
+    called = [(node.func.attr, node) for node in calls if isinstance(node.func, ast.Attribute)]
+    assert {name for name, _ in called} == set(lanenet.__all__)
+    for name, call in called:
         keywords = {word.arg: word.value for word in call.keywords if word.arg is not None}
         inspect.signature(getattr(lanenet, name)).bind(*call.args, **keywords)
 
 
 def test_the_names_are_seen() -> None:
-    assert {"load", "map", "label", "train"} <= set(dir(lanenet))
+    assert {"load", "map", "label", "train", "detect"} <= set(dir(lanenet))
     for name in lanenet.__all__:
         assert "Raises:" in (getattr(lanenet, name).__doc__ or "")

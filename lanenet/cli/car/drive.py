@@ -81,7 +81,7 @@ def drive(
     elif settings.actuator is not None and not arm:
         words = ["drive", config, *(overrides or []), "--arm" if steering_only else "--steering-only"]
     else:
-        words = ["bench"]
+        words = ["doctor", "--config", config]
     with console.told_or_lost():
         console.next_command(*words)
 

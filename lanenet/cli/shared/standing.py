@@ -18,6 +18,10 @@ from lanenet.viewers.mcap_file import is_own
 #: Folders deep that are looked into, and how many in all. Chosen: ``mycar/data/tub_1`` is found from the one
 #: above ``mycar``, and a home folder takes about a second.
 _DEPTH, _MOST_FOLDERS = 3, 1000
+#: Where ``train`` puts the maps that it makes, below the folder of its run.
+_MADE_MAPS = Path("drives") / "maps"
+#: The car's file, as the tutorial has it.
+_CAR = Path("car.yaml")
 #: Names of one kind that are listed.
 _MOST_NAMED = 4
 
@@ -99,19 +103,14 @@ def _say_next(here: Standing) -> None:
     if unlearned:
         console.next_command("train", unlearned[0], "--name", unlearned[0].name)
     elif here.maps:
-        path, drive = next(iter(here.maps.items()))
-        console.next_command("val", trained[drive.resolve()], path)
+        next_on_car()
     elif untried := [drive for drive in new if drive.resolve() not in tried]:
         name = untried[0].resolve().stem
         console.next_command("train", untried[0], "--lane-width", "CM", "--name", name)
     elif here.refused:
         console.say(f"next: read why there is no map, in {next(iter(here.refused)) / 'report.html'}")
     elif trained:
-        drive, checkpoint = next(iter(trained.items()))
-        camera = checkpoint / "camera.yaml"
-        console.next_command(
-            *("detect", drive, "--model", checkpoint, "--camera", camera, "--out", "runs/lanes.csv")
-        )
+        next_on_car()
     else:
         console.say(
             "next: copy a drive here (a Donkeycar tub, a folder with frames.csv, or a video), then "
@@ -119,12 +118,23 @@ def _say_next(here: Standing) -> None:
         )
 
 
+def next_on_car() -> None:
+    """Print what comes next once there is a network: it drives, or the file of its car is checked."""
+    if _CAR.is_file():
+        console.next_command("drive", _CAR, "--dry-run")
+    else:
+        console.next_command("doctor", "--config", "CAR.yaml")
+
+
 def _folders(top: Path) -> Iterator[tuple[Path, list[Path]]]:
     """Yield folders with their sorted contents, the nearest first; what a found thing holds is left out."""
-    level, looked = [top], 0
+    level, looked, seen = [top], 0, set[Path]()
     for depth in range(_DEPTH + 1):
         below: list[Path] = []
         for path in level:
+            if path in seen:
+                continue
+            seen.add(path)
             restore_output(path)
             try:
                 entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
@@ -132,6 +142,8 @@ def _folders(top: Path) -> Iterator[tuple[Path, list[Path]]]:
                 continue
             looked += 1
             yield path, entries
+            if depth < _DEPTH and (path / _MADE_MAPS).is_dir():
+                below += sorted(entry for entry in (path / _MADE_MAPS).iterdir() if entry.is_dir())
             known = ("map.yaml", "refused.yaml", "checkpoint.yaml")
             whole = any(path / name in entries for name in known) or find_format(path) is not None
             if depth < _DEPTH and not whole and looked + len(below) < _MOST_FOLDERS:

@@ -156,7 +156,7 @@ def test_a_dry_run_shows_what_would_be_sent(car: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "24 frames" in result.output and "driving 100 %" in result.output
     assert "ended: the recording is over" in result.output
-    assert "next: lanenet bench" in result.output
+    assert f"next: lanenet doctor --config {car}" in result.output
 
 
 def test_the_log_and_the_live_line_go_to_stderr_and_leave_nothing_behind(car: Path) -> None:

@@ -255,13 +255,7 @@ def test_what_detect_suggests_runs_with_all_that_was_given(tmp_path: Path) -> No
         assert again[again.index(option) + 1] == value
     assert {"--any-camera", "--skip-unreadable"} <= set(again)
     result = run(*again)
-    assert next_words(result) == [
-        "bench",
-        "--model",
-        str(CHECKPOINT),
-        "--camera",
-        str(tmp_path / "camera.yaml"),
-    ]
+    assert next_words(result) == ["doctor", "--config", "CAR.yaml"]
     assert (tmp_path / "l.mp4").stat().st_size > 0 and list(read_detections(tmp_path / "l.csv").frame) == [
         1,
         2,
@@ -279,7 +273,9 @@ def test_what_val_suggests_runs(tmp_path: Path, simulation: Path, monkeypatch: p
     # A label set has no frames to detect on.
     labels = label_set(tmp_path / "l.parquet", META.camera_hashes[0])
     on_labels = next_words(run("val", CHECKPOINT, labels, "--no-baselines"))
-    assert on_labels == ["bench", "--model", str(CHECKPOINT / "model.onnx")]
+    assert on_labels == ["doctor", "--config", "CAR.yaml"]
+    Path("car.yaml").touch()
+    assert next_words(run("val", CHECKPOINT, labels, "--no-baselines")) == ["drive", "car.yaml", "--dry-run"]
     # A network from --also is no detector's name.
     of_other = next_words(run("val", "d", "--also", CHECKPOINT, "--any-camera", "--detectors", "painter"))
     for words in (of_network, of_filter, of_other):

@@ -53,12 +53,23 @@ def test_it_goes_with_the_user_from_drive_to_network(here: Path) -> None:
     add_map(here / "checkpoints" / "tub_1", tub, "checkpoint")
     run = {"data": {"drives": [{"path": str(here / "runs" / "tub_1")}]}}
     (here / "checkpoints" / "tub_1" / "run.yaml").write_text(yaml.safe_dump(run))
-    assert "next: lanenet val checkpoints/tub_1 runs/tub_1" in said()
-    # The map of a whole training lies deeper than is looked.
-    (here / "runs" / "tub_1" / "map.yaml").rename(here / "runs" / "a")
+    # There is a network: what comes next is the car.
+    assert "next: lanenet doctor --config CAR.yaml" in said()
+    (here / "car.yaml").touch()
+    assert "next: lanenet drive car.yaml --dry-run" in said()
+    (here / "runs" / "tub_1" / "map.yaml").unlink()
     run["data"]["drives"][0]["path"] = str(tub)
     (here / "checkpoints" / "tub_1" / "run.yaml").write_text(yaml.safe_dump(run))
-    assert f"next: lanenet detect {tub} --model checkpoints/tub_1" in said()
+    assert "next: lanenet drive car.yaml --dry-run" in said()
+
+
+@pytest.mark.parametrize("run", ["runs/mycar", "run", "."])
+def test_the_map_that_a_training_made_is_listed_once(here: Path, run: str) -> None:
+    drive = write_drive(here / "lap", 2)
+    add_map(here / run / "drives" / "maps" / "lap-1234", drive, verdict="good")
+    made = Path(run) / "drives" / "maps" / "lap-1234"
+    assert list(look_around(Path()).maps) == [made] and f"maps         {made}\n" in said()
+    assert f"next: lanenet train {made} --name lap-1234" in said()
 
 
 @pytest.mark.parametrize("name", ["map", "refused"])
