@@ -117,6 +117,7 @@ def assemble(
         held_out=prepared.held_out[rows],
         # Found by the check.
         contradicted=np.zeros((len(rows), 2), dtype=bool),
+        marks=tuple(prepared.marks[row] for row in rows.tolist()) if prepared.marks else None,
     )
     return AssembledMap(drive_map, segments, rows, factor, lane.scaled(factor))
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from lanenet.config import Settings
-from lanenet.data.drives import meant_instead
+from lanenet.data.drives import find_format, meant_instead
+from lanenet.data.drives.content import content_key
 from lanenet.data.files import write_json
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.outputs import lock_output
@@ -30,13 +31,22 @@ def _plain(value: Any) -> Any:
 
 
 def fingerprint(path: Path) -> str:
-    """Hash name, size and time of a recording's files: cheap, and changes when the recording does.
+    """Hash what a recording, or another source of an output, is made of: cheap, and changes when that does.
+
+    Of a drive its content counts (:func:`lanenet.data.drives.content.content_key`), with the files beside one
+    that is a file; it may have been copied. Of anything else it is name, size and time of the files, by which
+    too much may be made again, but never too little.
 
     Raises:
         DriveFormatError: If the recording does not exist.
     """
     if not path.exists():
         raise DriveFormatError(f"{path}: no such drive{meant_instead(path)}")
+    known = find_format(path)
+    if known is not None:
+        beside = [path.with_name(name.format(stem=path.stem)) for name in known.files if "{stem}" in name]
+        found = [path, *(file for file in beside if file.is_file() and path.is_file())]
+        return key_of(*(content_key(file) for file in found))
     files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.is_file())
     return key_of(*((p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files))
 

@@ -14,6 +14,7 @@ from datagen.slam.commands import habitual_pauses
 from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Commands, Drive, open_drive
+from lanenet.data.drives.content import image_marks
 from lanenet.data.drives.recording import COMMAND_NAMES, MAX_PAUSE_S, ImageSource
 from lanenet.data.segments import true_runs
 from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError, counted
@@ -90,6 +91,8 @@ class PreparedDrive:
         camera: The camera, where it is known.
         notes: What was left out or assumed, a sentence each.
         pauses: How often the recording pauses, if it does so again and again.
+        marks: By what the image of each frame is known again, see
+            :func:`lanenet.data.drives.content.image_marks`; none if it is not to be.
     """
 
     request: MapRequest
@@ -99,6 +102,7 @@ class PreparedDrive:
     camera: Camera | None
     notes: tuple[str, ...]
     pauses: int = 0
+    marks: tuple[str, ...] = ()
 
     @property
     def known_lane_cm(self) -> float | None:
@@ -115,7 +119,10 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
             if the images are those of a full-circle fisheye, and the camera is not known.
         DriveFormatError: If the recording cannot be read.
     """
-    opened = keep_images(request.open_drive())
+    stored = request.open_drive()
+    # Before the images are used: what is recorded over them meanwhile is not what was mapped.
+    marks = dict(zip(stored.rows.tolist(), image_marks(stored), strict=True))
+    opened = keep_images(stored)
     recorded, unreadable = readable_frames(opened)
     check_count(recorded)
     check_moving(recorded)
@@ -141,7 +148,8 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
             )
     notes += [*found, *deleted, *nominal, *hidden]
     pauses = habitual_pauses(opened)
-    return PreparedDrive(request, drive, held_out, settings, known, tuple(notes), pauses)
+    of_frames = tuple(marks[row] for row in drive.rows.tolist())
+    return PreparedDrive(request, drive, held_out, settings, known, tuple(notes), pauses, of_frames)
 
 
 class KeptImages:

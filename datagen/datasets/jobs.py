@@ -26,6 +26,7 @@ from lanenet.data.camera_file import write_camera
 from lanenet.data.files import write_text
 from lanenet.data.label_set import read_label_index, read_labels, write_labels
 from lanenet.data.maps.folder import read_map
+from lanenet.data.maps.mapped_drive import open_mapped_drive
 from lanenet.errors import CalibrationError, ConfigError, TrackingLostError
 from lanenet.geometry.birdseye import BirdseyeWindow
 
@@ -298,7 +299,7 @@ class RecordedJob:
             progress: Called with (stage, done, total).
 
         Raises:
-            LanenetError: If the drive cannot be read or mapped.
+            LanenetError: If the drive cannot be read or mapped, or was recorded anew since it was mapped.
             ConfigError: If it is a map of a lane of another width, or frames are to be chosen from a map.
         """
         settings = self.recording
@@ -309,6 +310,9 @@ class RecordedJob:
             raise ConfigError(f"data.drives: {self.frames} is finished: frames are chosen before mapping")
         if self.is_map:
             self._check_width()
+            # Labels that are there already may need no drive; but not another one.
+            if Path(read_map(self.frames).meta.drive).exists():
+                open_mapped_drive(self.frames)
 
     def run(self) -> tuple[Part, ...]:
         """Make the three label sets, or the one that holds all of the drive.

@@ -25,6 +25,7 @@ from lanenet.data.maps.mapped_drive import (
     NOT_TO_LABEL,
     OUTSIDE,
     UNCERTAIN,
+    check_images,
     label_frames,
     labelled_points,
     open_mapped_drive,
@@ -74,8 +75,11 @@ def label_map(
 
     Raises:
         TrackingLostError: If the map was rejected, or no frame can be labelled.
+        DriveFormatError: If the drive was recorded anew since it was mapped.
     """
     mapped = open_mapped_drive(map_folder, drive)
+    # All images are read below; so are their bytes.
+    check_images(mapped, map_folder, every=True)
     drive_map = mapped.drive_map
     if not force:
         refuse_rejected(map_folder, drive_map)

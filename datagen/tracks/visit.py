@@ -98,7 +98,16 @@ def read_visit(folder: Path, drive_path: Path | None = None) -> Visit:
     known = drive_map.camera if meta.scale_from == "camera" else None
     request = MapRequest(mapped.drive.path, meta.lane_width_cm)
     settings = load_settings(MapSettings, folder / SETTINGS_NAME)
-    prepared = PreparedDrive(request, drive, drive_map.held_out[chosen], settings, known, ())
+    marks = drive_map.marks
+    prepared = PreparedDrive(
+        request,
+        drive,
+        drive_map.held_out[chosen],
+        settings,
+        known,
+        (),
+        marks=() if marks is None else tuple(marks[k] for k in chosen.tolist()),
+    )
     return Visit(
         folder,
         mapped,

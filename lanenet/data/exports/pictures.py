@@ -25,6 +25,8 @@ from lanenet.reading import MAX_IMAGE, read_bytes
 _KEPT_ENDINGS = (".jpg", ".jpeg", ".png")
 #: Distance of the points of a line that are projected. Chosen: a pixel or two, on which a lens bends nothing.
 _STEP_CM = 0.25
+#: Poses of a label set and of its map differ by less. Chosen: by ten times what rounding takes from 100 m.
+_SAME_POSE_CM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +136,12 @@ def open_pictures(path: Path, frames: Path) -> Pictures:
         raise LabelFormatError(f"{path}: frame {labels.frame[absent][0]} is not in {frames}")
     if (frames / "map.yaml").is_file():
         drive_map = (mapped.drive_map, found)
+        off_cm = np.abs(mapped.drive_map.poses[found] - labels.poses)[:, :2].max(initial=0.0)
+        if off_cm > _SAME_POSE_CM:
+            raise LabelFormatError(
+                f"{path}: its poses lie up to {off_cm:.2g} cm from those of {frames}, which was mapped anew "
+                f"since; make the labels again: lanenet label {frames} --out {path}"
+            )
     return Pictures(path, labels, drive, camera, rows[found], drive_map)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -45,6 +46,8 @@ SETTINGS_NAME = "settings.yaml"
 _POSE, _TILT = ("x_cm", "y_cm", "heading_rad"), ("pitch_rad", "roll_rad")
 _CONTRADICTED = tuple(f"contradicted_{side}" for side in SIDES)
 
+#: See :mod:`lanenet.data.drives.content`.
+_MARK = re.compile(r"[0-9]{1,18}-[0-9a-f]{16}")
 #: A map is longer than this. Chosen: the first few frames of the slowest car.
 _LEAST_MAP_CM = 1.0
 #: Lines of one side, counted from the driven lane; chosen: no model road has as many lanes.
@@ -108,6 +111,8 @@ class DriveMap:
         held_out: Frames whose edge points were not used for the lines.
         contradicted: Whether the images around a frame contradict its left, its right line, see
             :mod:`datagen.quality.residuals`.
+        marks: By what the image of each frame is known again, see
+            :func:`lanenet.data.drives.content.image_marks`; None in a map of an earlier version.
     """
 
     meta: MapMeta
@@ -123,6 +128,7 @@ class DriveMap:
     tilt_rad: Float[np.ndarray, "n 2"]
     held_out: Bool[np.ndarray, "n"]
     contradicted: Bool[np.ndarray, "n 2"]
+    marks: tuple[str, ...] | None = None
 
     def camera_at(self, k: int) -> Camera:
         """Return the camera with the tilt of the k-th frame."""
@@ -154,7 +160,7 @@ def write_map(
 ) -> None:
     """Write a map, without its pictures, into an existing folder."""
     m = drive_map
-    columns = {
+    columns: dict[str, Any] = {
         "frame": m.frames,
         "t_s": m.t_s,
         **dict(zip(_POSE, m.poses.T, strict=True)),
@@ -166,6 +172,8 @@ def write_map(
         "held_out": m.held_out,
         **dict(zip(_CONTRADICTED, m.contradicted.T, strict=True)),
     }
+    if m.marks is not None:
+        columns["image"] = m.marks
     write_csv(folder / "poses.csv", columns, allow_empty=("match",))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
     write_camera(folder / "camera.yaml", m.camera, how_calibrated)
@@ -241,6 +249,7 @@ def read_map(folder: Path) -> DriveMap:
             # Below 0 where most edges face the other way than those of the map.
             "match": ColumnSpec(allow_empty=True, low=-_MOST_MATCH, high=_MOST_MATCH),
             **{name: ColumnSpec("int", low=0.0, high=1.0) for name in ("held_out", *_CONTRADICTED)},
+            "image": ColumnSpec("text", required=False, allow_empty=True),
         },
         error=MapFormatError,
     )
@@ -260,11 +269,12 @@ def read_map(folder: Path) -> DriveMap:
         tilt_rad=np.stack([table[name] for name in _TILT], axis=1),
         held_out=table["held_out"] > 0,
         contradicted=np.stack([table[name] for name in _CONTRADICTED], axis=1) > 0,
+        marks=None if "image" not in table else tuple(table["image"].tolist()),
     )
 
 
 def _check_poses(path: Path, table: dict[str, np.ndarray]) -> None:
-    """Refuse poses that no drive has: none, or a car that never moved."""
+    """Refuse poses that no drive has: none, or a car that never moved; and what is no mark of an image."""
     n = len(table["frame"])
     if n == 0:
         raise MapFormatError(f"{path}: no frames")
@@ -273,6 +283,9 @@ def _check_poses(path: Path, table: dict[str, np.ndarray]) -> None:
         raise MapFormatError(
             f"{path}: all {n} frames lie within {across_cm:g} cm, expected at least {_LEAST_MAP_CM:g} cm"
         )
+    strange = [mark for mark in table.get("image", ()) if mark and not _MARK.fullmatch(mark)]
+    if strange:
+        raise MapFormatError(f"{path}: column 'image': expected SIZE-DIGEST, found {strange[0][:40]!r}")
 
 
 class MapVerdict(NamedTuple):

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import logging
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.config import check_settings, read_yaml
 from lanenet.data.drives import Drive, open_drive
+from lanenet.data.drives.content import other_images
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.label_set import Source
 from lanenet.data.maps.folder import SETTINGS_NAME, DriveMap, read_map
@@ -25,6 +28,12 @@ from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, POINT_NAMES, ROWS_CM, SIDES, STEEPEST, label_rows
 from lanenet.perception.edges.road import PerceptionSettings
 
+_log = logging.getLogger(__name__)
+
+#: Times of a frame that differ by less are the same, and share of other ones above which a drive is another
+#: one. Chosen: no table of times is rounded to more than a millisecond, and a drive recorded anew has other
+#: times throughout.
+_SAME_TIME_S, _MOST_OTHER_TIMES = 2e-3, 0.5
 #: Matched share of a frame's edge points below which its pose is uncertain. The lowest match in the
 #: first 300 frames of data/donkey_circuit is 0.24, the median 0.66.
 _MIN_MATCH = 0.15
@@ -89,7 +98,7 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
 
     Raises:
         MapFormatError: If the map cannot be read.
-        DriveFormatError: If the drive is not there, or lacks a frame of the map.
+        DriveFormatError: If the drive is not there, lacks a frame of the map, or was recorded anew.
         CalibrationError: If the map's camera is for images of another size.
     """
     drive_map = read_map(map_folder)
@@ -109,7 +118,53 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
     settings_path = map_folder / SETTINGS_NAME
     found = read_yaml(settings_path).get("perception", {})
     perception = check_settings(PerceptionSettings, found, f"{settings_path}: perception")
-    return MappedDrive(drive_map, drive, np.searchsorted(drive.frames, drive_map.frames), perception)
+    mapped = MappedDrive(drive_map, drive, np.searchsorted(drive.frames, drive_map.frames), perception)
+    check_images(mapped, map_folder)
+    return mapped
+
+
+def check_images(mapped: MappedDrive, map_folder: Path, every: bool = False) -> None:
+    """Refuse a drive whose images are not those that were mapped: Donkeycar records into one folder again.
+
+    A map of an earlier version does not know its images; of a folder the times of its frames are compared.
+
+    Args:
+        mapped: The map and its drive.
+        map_folder: Its folder, for messages.
+        every: Compare the bytes of all images; else their sizes, and the bytes of a sample.
+
+    Raises:
+        DriveFormatError: Says how many images differ, and what to type.
+    """
+    drive_map, drive = mapped.drive_map, mapped.drive.subset(mapped.rows)
+    if drive_map.marks is not None:
+        other, what = other_images(drive, drive_map.marks, every), "images"
+    else:
+        _warn(
+            f"{map_folder}: is a map of an earlier version, which does not know the images that it was made "
+            f"from: whether {drive.path} still holds them is not checked; map it anew to have it checked"
+        )
+        by_s = np.abs((drive.t_s - drive.t_s[0]) - (drive_map.t_s - drive_map.t_s[0]))
+        # Readers of videos have learned to read their times since.
+        known = drive.times_trusted and drive.path.is_dir()
+        other, what = known & (by_s > _SAME_TIME_S), "times"
+        other &= other.mean() > _MOST_OTHER_TIMES
+    if other.any():
+        width_cm = f"{drive_map.meta.lane_width_cm:g}"
+        again = shlex.join(
+            ["lanenet", "map", str(drive.path), "--lane-width", width_cm, "--out", str(map_folder)]
+        )
+        raise DriveFormatError(
+            f"{drive.path}: of {len(other)} frames of {map_folder} the {what} of {int(other.sum())} are not "
+            f"those that were mapped (first: frame {drive.frames[other][0]}): the drive was recorded anew or "
+            f"changed since; map it anew: {again}"
+        )
+
+
+@cache
+def _warn(text: str) -> None:
+    """Log a warning once: a command opens its map several times."""
+    _log.warning(text)
 
 
 def lines_at(drive_map: DriveMap, k: int, max_sigma_lanes: float = _MAX_SIGMA_LANES) -> FrameLines:

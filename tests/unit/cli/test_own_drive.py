@@ -148,6 +148,9 @@ def test_a_map_that_another_command_made_is_used(here: Path) -> None:
     # Not one of other settings, or of a drive that has changed.
     assert config_of(drive, lane_width_cm=41.0)["data"]["drives"][0]["path"] == str(drive)
     (drive / "drive.yaml").touch()
+    assert config_of(drive, lane_width_cm=40.0)["data"]["drives"][0]["path"] == str(here / "runs" / "lap")
+    image = next((drive / "images").iterdir())
+    image.write_bytes(image.read_bytes() + b"x")
     assert config_of(drive, lane_width_cm=40.0)["data"]["drives"][0]["path"] == str(drive)
 
 

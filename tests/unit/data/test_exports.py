@@ -55,6 +55,7 @@ def made(tmp_path: Path) -> tuple[Path, Path, LabelSet, DriveMap]:
     write_map(tmp_path / "map", lane, {"frame": np.arange(3)}, {"frames": N}, "by hand")
     (tmp_path / "map" / "settings.yaml").write_text("{}\n")
     labels = make_label_set(N, 3, camera_hash=CAMERA.hash)
+    labels = replace(labels, poses=lane.poses)
     labels.points_cm[2, 4] = np.nan
     # The map has them all, the label set leaves one out.
     labels = labels.subset(np.array([0, 1, 2, 4, 5]))

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -15,8 +16,11 @@ from typer.testing import CliRunner
 import lanenet
 from datagen.labels.label_map import label_map
 from datagen.settings import MapSettings
+from datagen.tracks.visit import read_visit
 from lanenet.cli.app import app
 from lanenet.config import dump_settings
+from lanenet.data.drives import Drive
+from lanenet.data.drives.content import image_marks
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, read_map, write_map
@@ -44,6 +48,7 @@ from lanenet.evaluation.sources import open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings
+from lanenet.viewers.mapped import MapToSee
 
 N = 30
 K = np.array([[40.0, 0.0, 31.5], [0.0, 40.0, 23.5], [0.0, 0.0, 1.0]])
@@ -133,6 +138,84 @@ def test_points_that_a_found_camera_leaves_open_are_not_labelled(folder):
         # A complete map would not label them either.
         window = BirdseyeWindow(left_cm=-150.0, columns=400)
         assert points_in_window(drive_map, 3, window)[:3].all() == labelled
+
+
+def with_marks(folder: Path) -> Drive:
+    """Write the map again as it is made today: it knows its images."""
+    mapped = open_mapped_drive(folder)
+    marks = tuple(image_marks(mapped.drive.subset(mapped.rows)))
+    write_map(folder, replace(mapped.drive_map, marks=marks), {"frame": np.arange(2)}, {}, "given")
+    return mapped.drive
+
+
+def record_anew(drive: Drive, times_s: float = 0.05) -> None:
+    """Record other images into the drive's folder, under the names that it had."""
+    rng = np.random.default_rng(7)
+    for path in drive.images.paths:
+        image = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+        path.write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
+    table = drive.path / "frames.csv"
+    rows = [line.split(",") for line in table.read_text().splitlines()]
+    for row in rows[1:]:
+        row[rows[0].index("t_s")] = f"{times_s * int(row[0]):.4f}"
+    table.write_text("".join(f"{','.join(row)}\n" for row in rows))
+
+
+def test_a_drive_that_was_recorded_anew_is_refused_by_every_reader_of_its_map(folder, tmp_path):
+    record_anew(with_marks(folder))
+    said = (
+        rf"of {len(MAPPED)} frames of .*map the images of {len(MAPPED)} are not those .* lanenet map .*drive "
+    )
+    for read in (
+        lambda: open_mapped_drive(folder),
+        lambda: label_map(folder, tmp_path / "l.parquet"),
+        lambda: read_map_frames(folder),
+        lambda: MapToSee(folder),
+        lambda: read_visit(folder),
+    ):
+        with pytest.raises(DriveFormatError, match=said):
+            read()
+    assert not (tmp_path / "l.parquet").exists()
+
+
+def test_one_other_image_is_never_labelled(folder, tmp_path):
+    """The sample may miss it where sizes agree; labelling reads all."""
+    drive = with_marks(folder)
+    path = drive.images.paths[MAPPED[5]]
+    path.write_bytes(path.read_bytes() + b"x")
+    with pytest.raises(DriveFormatError, match=r"images of 1 are not .*first: frame 5\)"):
+        label_map(folder, tmp_path / "l.parquet")
+    # A frame that was not mapped may be another one.
+    path.write_bytes(path.read_bytes()[:-1])
+    drive.images.paths[13].write_bytes(b"x")
+    label_map(folder, tmp_path / "l.parquet")
+
+
+def test_a_moved_drive_is_the_same(folder, tmp_path):
+    drive = with_marks(folder)
+    shutil.copytree(drive.path, tmp_path / "moved", copy_function=shutil.copyfile)
+    shutil.rmtree(drive.path)
+    assert len(open_mapped_drive(folder, tmp_path / "moved").rows) == len(MAPPED)
+
+
+def test_a_map_of_an_earlier_version_is_used_with_a_warning(folder, caplog):
+    drive = open_mapped_drive(folder).drive
+    assert "is a map of an earlier version, which does not know the images" in caplog.text
+    caplog.clear()
+    record_anew(drive)
+    assert len(open_mapped_drive(folder).rows) == len(MAPPED) and not caplog.text  # once is enough
+    # What such a map knows of its drive is its times.
+    record_anew(drive, 0.06)
+    with pytest.raises(DriveFormatError, match="the times of 25 are not those"):
+        open_mapped_drive(folder)
+
+
+def test_a_damaged_mark_is_refused(folder):
+    with_marks(folder)
+    table = folder / "poses.csv"
+    table.write_text(table.read_text().replace("-", "+"))
+    with pytest.raises(MapFormatError):
+        open_mapped_drive(folder)
 
 
 def test_frames_after_an_unmapped_stretch_start_afresh(folder):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from drives import write_drive, write_video
 
 from datagen.made import Output, fingerprint, key_of
 from lanenet.config import Settings
@@ -70,6 +72,32 @@ def test_a_recording_that_changes_has_another_fingerprint(tmp_path):
     assert first != fingerprint(tmp_path)
     with pytest.raises(DriveFormatError, match="no such drive"):
         fingerprint(tmp_path / "nowhere")
+
+
+def test_a_drive_is_known_by_its_content(tmp_path):
+    """Not by the times of its files, which a copy has not, nor by names that a recorder uses again."""
+    drive = write_drive(tmp_path / "drive", n=80)
+    first, images = fingerprint(drive), sorted((drive / "images").iterdir())
+    stats = [path.stat() for path in images]
+    for path in images:
+        os.utime(path)
+    (drive / ".DS_Store").touch()
+    assert fingerprint(drive) == first
+    for path, before in zip(images, stats, strict=True):
+        data = bytearray(path.read_bytes())
+        data[-3] ^= 1
+        path.write_bytes(data)
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert fingerprint(drive) != first
+
+
+def test_the_table_beside_a_video_is_a_part_of_it(tmp_path):
+    video = write_video(tmp_path / "a.mp4")
+    first = fingerprint(video)
+    (tmp_path / "b.csv").write_text("frame,t_s\n0,0.0\n")
+    assert fingerprint(video) == first
+    (tmp_path / "a.csv").write_text("frame,t_s\n0,0.0\n")
+    assert fingerprint(video) != first
 
 
 def test_what_is_forgotten_is_done_again(labels_file):

@@ -24,7 +24,10 @@ from datagen.fleet.storage import MARK_NAME, OWN_NAMES, Storage
 from datagen.fleet.task import FleetSettings
 from datagen.fleet.work import Outcome
 from datagen.settings import MapSettings
+from lanenet.data.drives import open_drive
+from lanenet.data.drives.content import image_marks
 from lanenet.data.label_set import read_labels
+from lanenet.data.maps.folder import read_map
 
 
 def test_a_drive_becomes_a_map_and_a_label_set(tiny: Path, labelled: Path):
@@ -37,6 +40,8 @@ def test_a_drive_becomes_a_map_and_a_label_set(tiny: Path, labelled: Path):
     assert mapped["took"]["cpu_s"] > 0 and mapped["took"]["peak_bytes"] > 1e8 and mapped["bytes"] > 1e5
     assert (labelled / index["map"] / "thumbnail.jpg").read_bytes()[:2] == b"\xff\xd8"
     assert not list(labelled.glob("*/.*"))
+    # The map knows its drive again by the bytes of its images.
+    assert read_map(labelled / index["map"]).marks == tuple(image_marks(open_drive(tiny)))
     # All of which the storage asks whether others have it.
     assert {path.name for path in labelled.iterdir()} <= {*OWN_NAMES, MARK_NAME}
 
