@@ -102,6 +102,7 @@ class LaneSmoother:
             offset_cm=estimate.offset_cm,
             presence=estimate.presence,
             own_lane=estimate.own_lane,
+            lines_px=estimate.lines_px,
         )
 
     def _predict(self, dt_s: float, travel_cm: float, steering_rad: float) -> None:

@@ -12,6 +12,7 @@ from lanenet.data.tables import VERSION_NAME, float_array, write_csv, write_parq
 from lanenet.errors import LabelFormatError
 from lanenet.geometry.lane import POINT_NAMES, SIDES
 from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.image_lane import LINE_PX_NAMES
 
 FORMAT_VERSION = 1
 FORMAT = f"lanenet-detections/{FORMAT_VERSION}"
@@ -20,6 +21,8 @@ SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for 
 PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")
 #: Written only by detectors that measure them.
 LANE_NAMES: tuple[str, ...] = ("radius_cm", "offset_cm", "own_lane")
+#: Written only by detectors that work on lines of the image, then in every row; empty for a missing line.
+IMAGE_LINE_NAMES: tuple[str, ...] = tuple(f"{side}_{name}" for side in SIDES for name in LINE_PX_NAMES)
 #: Columns with empty cells where a detector does not know the value.
 _OPEN_COLUMNS = ("t_s", *POINT_NAMES, *SIGMA_NAMES, *PARABOLA_NAMES, "steering_rad")
 #: A straight lane has an infinite radius.
@@ -32,6 +35,7 @@ class DetectionTable:
     def __init__(self) -> None:
         self._frames: list[int] = []
         self._rows: list[np.ndarray] = []
+        self._has_image_lines = False
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -39,6 +43,8 @@ class DetectionTable:
     def add(self, frame: int, t_s: float, estimate: LaneEstimate) -> None:
         """Append the estimate of one frame; ``t_s`` is NaN if there is no time."""
         self._frames.append(int(frame))
+        lines_px = estimate.lines_px
+        self._has_image_lines |= lines_px is not None
         self._rows.append(
             np.concatenate(
                 [
@@ -48,6 +54,7 @@ class DetectionTable:
                     estimate.parabolas.ravel(),
                     [estimate.steering_rad, estimate.confidence],
                     [estimate.radius_cm, estimate.offset_cm, estimate.own_lane],
+                    np.full(len(IMAGE_LINE_NAMES), np.nan) if lines_px is None else lines_px.ravel(),
                 ]
             )
         )
@@ -60,7 +67,7 @@ class DetectionTable:
             MissingExtraError: If pyarrow is not installed and the table is Parquet.
         """
         ending = _ending(path)
-        names = (*_OPEN_COLUMNS, "confidence", *LANE_NAMES)
+        names = (*_OPEN_COLUMNS, "confidence", *LANE_NAMES, *IMAGE_LINE_NAMES)
         rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(names))
         columns = {name: rows[:, k] for k, name in enumerate(names)}
         for name, values in columns.items():
@@ -73,13 +80,14 @@ class DetectionTable:
                 value = "NaN" if np.isnan(values[row]) else str(values[row])
                 raise LabelFormatError(f"{path}: frame {self._frames[row]}, column {name!r}: found {value}")
         unknown = [name for name in LANE_NAMES if np.isnan(columns[name]).all()]
+        unknown += [] if self._has_image_lines else IMAGE_LINE_NAMES
         columns = {name: values for name, values in columns.items() if name not in unknown}
         frame = np.array(self._frames, dtype=np.int64)
         if ending == ".csv":
             write_csv(
                 path,
                 {"frame": frame, **columns, VERSION_NAME: np.full(len(frame), FORMAT_VERSION)},
-                allow_empty=(*_OPEN_COLUMNS, *LANE_NAMES),
+                allow_empty=(*_OPEN_COLUMNS, *LANE_NAMES, *IMAGE_LINE_NAMES),
                 allow_infinite=_INFINITE_COLUMNS,
             )
             return
@@ -93,6 +101,11 @@ class DetectionTable:
             "a": "1/cm",
             "b": "1",
             "c": "centimetre",
+            "_u_px": "pixel",
+            "_v_px": "pixel",
+            "_a_px": "1/pixel",
+            "_b_px": "1",
+            "_c_px": "pixel",
         }
         write_parquet(path, arrays, {"format": FORMAT, "units": units})
 

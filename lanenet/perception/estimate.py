@@ -38,6 +38,9 @@ class LaneEstimate:
             not know it.
         centre_line_cm: The lane's centre before, at and beyond a corner that is too sharp for parabolas,
             [cm], frame car; None elsewhere.
+        lines_px: Left and right line in the image, the numbers of
+            :data:`lanenet.perception.image_lane.LINE_PX_NAMES`; NaN for a missing line, None from a detector
+            that does not work on lines of the image.
     """
 
     points_cm: Float[np.ndarray, "6"] = field(default_factory=lambda: np.full(N_POINTS, np.nan))
@@ -49,6 +52,7 @@ class LaneEstimate:
     presence: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(len(SIDES), np.nan))
     own_lane: float = float("nan")
     centre_line_cm: Float[np.ndarray, "3 2"] | None = None
+    lines_px: Float[np.ndarray, "2 7"] | None = None
 
     @property
     def mask(self) -> np.ndarray:

@@ -22,6 +22,9 @@ _NEAR_END_CM = 20.0
 _SAMPLES = 41
 
 Polyline = Float[np.ndarray, "_ 2"]
+#: A line of the image as numbers: its nearest and its farthest point inside the image, and between their rows
+#: the parabola u = a v^2 + b v + c, all in pixels.
+LINE_PX_NAMES = ("near_u_px", "near_v_px", "far_u_px", "far_v_px", "a_px", "b_px", "c_px")
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,10 @@ class ImageLane:
     filled: bool = False
     text: str = ""
 
+    def numbers_px(self, width: int, height: int) -> Float[np.ndarray, "2 7"]:
+        """Return left and right line as the numbers of :data:`LINE_PX_NAMES`; NaN for a missing line."""
+        return np.stack([describe_line(line, width, height) for line in (self.left_px, self.right_px)])
+
 
 def to_bgr(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return a colour or gray frame as colour.
@@ -51,6 +58,38 @@ def to_bgr(frame_bgr: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w 3"]
     """
     frame = check_frame(frame_bgr)
     return frame if frame.ndim == 3 else np.asarray(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
+
+
+def describe_line(line_px: Polyline | None, width: int, height: int) -> Float[np.ndarray, "7"]:
+    """Return the numbers of :data:`LINE_PX_NAMES` for a line of the image.
+
+    The parabola is fitted to the points inside the image, by least squares; for two points, it is straight.
+
+    Args:
+        line_px: Polyline, [px], frame image; None for a missing line.
+        width: Of the image, [px].
+        height: Of the image, [px].
+
+    Returns:
+        The seven numbers; NaN where fewer than two rows of the line lie inside the image.
+    """
+    missing = np.full(len(LINE_PX_NAMES), np.nan)
+    if line_px is None:
+        return missing
+    inside = ((line_px >= 0.0) & (line_px <= [width - 1.0, height - 1.0])).all(axis=1)
+    u, v = line_px[inside].T
+    if len(v) < 2 or np.ptp(v) < 1.0:
+        return missing
+    near, far = int(np.argmax(v)), int(np.argmin(v))
+    # Rows from -1 to 1 keep the fit well conditioned.
+    middle, half = 0.5 * (v[near] + v[far]), 0.5 * (v[near] - v[far])
+    t = (v - middle) / half
+    degree = min(2, len(np.unique(v)) - 1)
+    p, q, r = np.concatenate([np.zeros(2 - degree), np.polyfit(t, u, degree)])
+    a = p / half**2
+    b = q / half - 2.0 * a * middle
+    c = r - q * middle / half + a * middle**2
+    return np.array([u[near], v[near], u[far], v[far], a, b, c])
 
 
 def sample_segment(

@@ -183,6 +183,7 @@ class HoughTracker:
             points_cm=points.reshape(N_POINTS),
             steering_rad=float("nan") if steered is None else math.radians(steered),
             confidence=0.5 * (left is not None) + 0.5 * (right is not None),
+            lines_px=self.last.numbers_px(frame.shape[1], frame.shape[0]),
         )
 
     def find_lines(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> tuple[Segment | None, Segment | None]:

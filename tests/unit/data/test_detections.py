@@ -4,13 +4,15 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 from detections import read_detections
 
-from lanenet.data.detections import DetectionTable
+from lanenet.data.detections import IMAGE_LINE_NAMES, DetectionTable
 from lanenet.geometry.lane import POINT_NAMES, POINTS_FROM_PARABOLA
 from lanenet.perception.estimate import LaneEstimate
+from lanenet.perception.image_lane import LINE_PX_NAMES
 
 PARABOLAS = np.array([[0.01, -0.2, -20.0], [-0.02, 0.3, 20.5]])
 FULL = LaneEstimate((PARABOLAS @ POINTS_FROM_PARABOLA.T).ravel(), np.arange(1.0, 7.0), 0.25, 0.875)
@@ -93,3 +95,34 @@ def test_an_empty_table(tmp_path: Path, name: str) -> None:
     assert len(back.frame) == 0
     assert back.points_cm.shape == (0, 6)
     assert back.parabolas.shape == (0, 2, 3)
+
+
+@pytest.mark.parametrize("name", ["seen.csv", "seen.parquet"])
+def test_lines_of_the_image_are_written_in_pixels(tmp_path: Path, name: str) -> None:
+    # A detector that works on the image and finds a line on the right only, then none.
+    lines_px = np.full((2, len(LINE_PX_NAMES)), np.nan)
+    lines_px[1] = [600.0, 479.0, 330.0, 250.0, 1e-4, 1.1, 50.0]
+    table = make_table()
+    table.add(8, 0.4, LaneEstimate(lines_px=lines_px))
+    table.add(9, 0.45, LaneEstimate(lines_px=np.full_like(lines_px, np.nan)))
+    table.write(tmp_path / name)
+    read = pyarrow.csv.read_csv if name.endswith("csv") else pq.read_table
+    columns = read(tmp_path / name).to_pydict()
+    found = {key: values for key, values in columns.items() if key.endswith("_px")}
+    assert tuple(found) == IMAGE_LINE_NAMES
+    # Frames of other detectors, and lines that were not found, are empty cells.
+    assert all(value is None for key in found for value in found[key][:3] + found[key][4:])
+    assert all(found[f"left_{key}"][3] is None for key in LINE_PX_NAMES)
+    assert [found[f"right_{key}"][3] for key in LINE_PX_NAMES] == pytest.approx(lines_px[1].tolist())
+    if name.endswith("parquet"):
+        metadata = pq.read_schema(tmp_path / name).metadata[b"lanenet"]
+        assert json.loads(metadata)["units"]["_u_px"] == "pixel"
+
+
+def test_a_detector_of_the_image_that_found_nothing_has_the_columns_all_the_same(tmp_path: Path) -> None:
+    table = DetectionTable()
+    table.add(0, 0.0, LaneEstimate(lines_px=np.full((2, len(LINE_PX_NAMES)), np.nan)))
+    table.write(tmp_path / "seen.csv")
+    header, row = (tmp_path / "seen.csv").read_text().splitlines()
+    cells = dict(zip(header.split(","), row.split(","), strict=True))
+    assert [cells[key] for key in IMAGE_LINE_NAMES] == [""] * len(IMAGE_LINE_NAMES)
