@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from pydantic import Field
 
 from lanenet.config import Settings
+from lanenet.errors import counted
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import N_POINTS, ROWS_CM, proportional_angle_rad
 from lanenet.perception.edges.canny import check_size
@@ -49,6 +50,7 @@ from lanenet.perception.painter.markings import (
     straight_px,
     weigh,
 )
+from lanenet.perception.painter.scene import ROAD, VanishingPoint, continue_line, find_road_trapezoid
 
 #: Smaller frames have too few rows to tell a line from chance; chosen: less than half of the smallest frames
 #: in use (160 x 120 px).
@@ -62,6 +64,11 @@ class PainterSettings(Settings):
     """Pentek's painter; the defaults are the paper's where it gives one.
 
     Attributes:
+        scene: Without a camera: ``road`` takes the region of interest from the vanishing point of the image
+            and, where a settings file does not say otherwise, the settings of
+            :data:`lanenet.perception.painter.scene.ROAD`; ``model_car`` takes the proportions of a road
+            image and these defaults; ``auto`` takes ``road`` once the segments of a drive's frames meet in
+            a point.
         mode: ``photo`` takes each frame by itself, ``video`` averages the lines over frames.
         video_weight: ``video``: weight of the current frame in the average.
         hold_frames: ``video``: a line is drawn and expected for so many frames after it was last found.
@@ -74,6 +81,7 @@ class PainterSettings(Settings):
         evidence: What a line has to show before it is answered.
     """
 
+    scene: Literal["auto", "road", "model_car"] = "auto"
     mode: Literal["photo", "video"] = "video"
     video_weight: float = Field(default=0.5, gt=0.0, le=1.0)
     hold_frames: int = Field(default=5, ge=0)
@@ -114,6 +122,8 @@ class PaintedLane:
 class LanePainter:
     """Frame in, lane out, by joined Hough lines and curves through the edges beside them.
 
+    Without a camera the scene decides on the settings; see :class:`PainterSettings`.
+
     With a camera the lines are moved to the road and answered as far as they are seen, and the steering aims
     at the lane's centre some camera heights ahead. Without one the points are NaN, and the steering is the
     angle in the image from straight up to the lane's centre halfway up the region, seen from the middle of
@@ -139,11 +149,31 @@ class LanePainter:
         self._earlier: list[SolidLine | None] = [None, None]
         self._missed = [0, 0]
         self._shape: tuple[int, int] | None = None
+        self._vanishing = VanishingPoint()
+        self._trapezoid_px: Float[np.ndarray, "4 2"] | None = None
+        #: The settings of the last frame: those for roads where it shows one.
+        self._chosen = self.settings
+        self._for_roads = _with_road_settings(self.settings)
+        self._frames = self._frames_of_roads = 0
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
         self.last, self.lane = ImageLane(), PaintedLane()
         self._earlier, self._missed = [None, None], [0, 0]
+        self._vanishing, self._trapezoid_px = VanishingPoint(), None
+
+    @property
+    def hint(self) -> str:
+        """Which settings the frames so far were given, across resets, and how to choose others."""
+        if self.camera is not None or self._frames == 0:
+            return ""
+        roads = self._frames_of_roads
+        scene = "model_car" if 2 * roads > self._frames else "road"
+        return (
+            f"without a camera file, the painter took {roads} of {counted(self._frames, 'frame')} for a "
+            "full-size road, whose straight lines meet in a point, and else the settings for model cars; "
+            f"'scene: {scene}' in a settings file (--config) chooses for all"
+        )
 
     def detect(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> LaneEstimate:
         """Find the lane in one frame.
@@ -160,7 +190,7 @@ class LanePainter:
         self._shape = (height, width)
         if min(height, width) < _MIN_SIDE_PX:
             return LaneEstimate()
-        trapezoid = find_trapezoid(width, height, self.camera, self.settings.edges)
+        trapezoid = self._find_region(frame)
         found = self._smooth(self._find(frame, trapezoid), trapezoid)
         rows = np.full((2, len(ROWS_CM)), np.nan)
         if self.camera is not None:
@@ -168,18 +198,39 @@ class LanePainter:
                 if marking is not None:
                     rows[side] = rows_of_points(self._seen(marking))
         self.lane = PaintedLane() if self.camera is None else measure_lane(found, rows)
-        self.last = self._image_lane(found, trapezoid)
+        self.last = self._image_lane(found, trapezoid, height)
         return LaneEstimate(
             points_cm=rows.reshape(N_POINTS),
             steering_rad=self._steering_rad(found, trapezoid),
             confidence=0.5 * sum(marking is not None for marking in found),
             radius_cm=self.lane.radius_cm,
             offset_cm=self.lane.offset_cm,
+            lines_px=self.last.numbers_px(width, height),
         )
+
+    def _find_region(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "4 2"]:
+        """Choose settings and region of this frame; lines of earlier frames move to the region's rows."""
+        height, width = frame_bgr.shape[:2]
+        settings = self.settings
+        is_road = settings.scene == "road"
+        trapezoid = find_trapezoid(width, height, self.camera, settings.edges)
+        if self.camera is None and settings.scene != "model_car" and settings.edges.trapezoid is None:
+            self._vanishing.see(frame_bgr, settings.edges)
+            if self._vanishing.point_px is not None:
+                is_road = True
+                trapezoid = find_road_trapezoid(self._vanishing.point_px, height)
+        self._chosen = self._for_roads if is_road and self.camera is None else settings
+        self._frames += 1
+        self._frames_of_roads += is_road
+        before = self._trapezoid_px
+        if before is not None:
+            self._earlier = [None if x is None else x.between(before, trapezoid) for x in self._earlier]
+        self._trapezoid_px = trapezoid
+        return trapezoid
 
     def _find(self, frame_bgr: UInt8[np.ndarray, "h w 3"], trapezoid_px: Float[np.ndarray, "4 2"]) -> Pair:
         """The lines that this frame shows."""
-        chosen = self.settings
+        chosen = self._chosen
         edges = find_painter_edges(frame_bgr, trapezoid_px, chosen.edges)
         segments = find_painter_segments(edges, float(trapezoid_px[2, 1] - trapezoid_px[0, 1]), chosen.lines)
         earlier = (self._earlier[0], self._earlier[1])
@@ -223,7 +274,7 @@ class LanePainter:
                 continue
             before = self._earlier[k]
             # A different line than before; their mean would lie on neither.
-            if not are_close(marking.line, before, 2.0 * agree_px(trapezoid_px, self.settings.lines)):
+            if not are_close(marking.line, before, 2.0 * agree_px(trapezoid_px, self._chosen.lines)):
                 before = None
             line = blend(marking.line, before, self.settings.video_weight)
             self._earlier[k], self._missed[k] = line, 0
@@ -250,8 +301,13 @@ class LanePainter:
         y = marking.points[:, 1]
         return marking.points[(y >= ahead.min()) & (y <= ahead.max())]
 
-    def _image_lane(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"]) -> ImageLane:
+    def _image_lane(self, found: Pair, trapezoid_px: Float[np.ndarray, "4 2"], height: int) -> ImageLane:
         left, right = (None if marking is None else marking.line_px for marking in found)
+        point_px = self._vanishing.point_px
+        if point_px is not None:
+            left, right = (
+                None if line is None else continue_line(line, point_px, height) for line in (left, right)
+            )
         memory = tuple(
             straight_px(line, trapezoid_px)
             for line, marking in zip(self._earlier, found, strict=True)
@@ -275,6 +331,14 @@ class LanePainter:
         middle = 0.5 * sum(float(np.interp(-row, -line[:, 1], line[:, 0])) for line in lines)
         start = 0.5 * float(trapezoid_px[2, 0] + trapezoid_px[3, 0])
         return math.atan2(start - middle, bottom - row)
+
+
+def _with_road_settings(settings: PainterSettings) -> PainterSettings:
+    """The settings for roads, where those that were given do not say otherwise."""
+    given = settings.model_dump(exclude_unset=True)
+    for name, values in ROAD.items():
+        given[name] = {**values, **given.get(name, {})}
+    return PainterSettings.model_validate(given)
 
 
 def measure_lane(found: Pair, rows_cm: Float[np.ndarray, "2 3"]) -> PaintedLane:

@@ -177,6 +177,12 @@ class SolidLine:
     bottom_px: float
     top_px: float
 
+    def between(self, old: Float[np.ndarray, "4 2"], new: Float[np.ndarray, "4 2"]) -> SolidLine:
+        """Return the same line of the old region between the rows of the new one."""
+        slope = (self.bottom_px - self.top_px) / (old[2, 1] - old[0, 1])
+        ends = (self.top_px + slope * (row - old[0, 1]) for row in (new[2, 1], new[0, 1]))
+        return SolidLine(*map(float, ends))
+
 
 def find_painter_segments(
     edges: UInt8[np.ndarray, "h w"], region_height_px: float, settings: PainterLineSettings
