@@ -28,7 +28,7 @@ from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
 from lanenet.data.maps.folder import FORMAT
 from lanenet.errors import TrackingLostError
 from lanenet.evaluation.answers import RasterAnswers, RasterModel
-from lanenet.geometry.birdseye import BirdseyeWindow
+from lanenet.geometry.birdseye import GENERAL_WINDOW, BirdseyeWindow
 from lanenet.onboard.bench import example_camera, example_frames
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.network.model_file import ModelMeta
@@ -303,14 +303,16 @@ def test_map_that_is_lost_says_so(asked: Asked) -> None:
 
 def test_label_hands_on_its_arguments(asked: Asked) -> None:
     asked.module("datagen.pipeline", label_map=asked.function("label", Report(("7 frames mapped",))))
+    # That of the shipped network, which shows wide lanes, too.
+    wide = {"window": GENERAL_WINDOW}
     result = run("label", "m/one", "--out", "one.parquet")
     assert result.exit_code == 0, result.output
     assert asked.calls["label"][:2] == (Path("m/one"), Path("one.parquet"))
-    assert asked.options["label"] == {"force": False, "colour_weight": 0.75}
+    assert asked.options["label"] == {"force": False, "colour_weight": 0.75, **wide}
     assert run("label", "m/one", "--out", "one.parquet", "--colour-weight", "0").exit_code == 0
     assert asked.options["label"]["colour_weight"] == 0.0
     assert run("label", "m/one", "--force", "--out", "one.parquet").exit_code == 0
-    assert asked.options["label"] == {"force": True, "colour_weight": 0.75}
+    assert asked.options["label"] == {"force": True, "colour_weight": 0.75, **wide}
     assert ".parquet" in error_of(run("label", "m/one", "--out", "one.txt"))
 
 
