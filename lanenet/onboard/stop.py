@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lanenet.errors import ConfigError, HardwareError, LanenetError, MotorMayRunError, printable
+from lanenet.onboard.car_file import with_full_paths
 from lanenet.onboard.i2c import GUARD_MODULE, describe_process, lock_owners, words_of
 from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
 from lanenet.reading import MEBIBYTE, read_text
@@ -53,7 +54,7 @@ def read_actuator(path: Path, overrides: Sequence[str] = ()) -> ActuatorSettings
     from lanenet.config import apply_overrides, read_yaml
     from lanenet.onboard.actuators import check_actuator
 
-    data = apply_overrides(read_yaml(path), list(overrides))
+    data = apply_overrides(with_full_paths(read_yaml(path), path), list(overrides))
     if data.get("actuator") is None:
         raise ConfigError(f"{path}: key 'actuator' is missing: there is no motor to stop")
     return check_actuator(data["actuator"], str(path))
@@ -128,7 +129,8 @@ def _tell_guards(path: Path) -> None:
 
     # What is wrong with the file, or cannot be ended, is said later.
     with contextlib.suppress(Exception):
-        ours = _device_of(yaml.safe_load(read_text(path, ConfigError, MEBIBYTE))["actuator"])
+        data = yaml.safe_load(read_text(path, ConfigError, MEBIBYTE))
+        ours = _device_of(with_full_paths(data, path)["actuator"])
         for pid, words in _guards():
             with contextlib.suppress(Exception):
                 if _device_of(json.loads(words[words.index(GUARD_MODULE) + 3])) == ours:
