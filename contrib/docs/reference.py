@@ -16,7 +16,7 @@ import typer
 from pydantic import BaseModel
 
 from lanenet.cli.app import app
-from lanenet.cli.shared.schemas import Section, files_on_the_car, files_on_the_workstation, sections, shown
+from lanenet.cli.schemas import Section, files_on_the_car, files_on_the_workstation, sections, shown
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from lanenet.cli.schemas import Section, Setting, files_on_the_car, files_on_the_workstation, sections
 from lanenet.cli.shared import console
-from lanenet.cli.shared.schemas import Section, Setting, files_on_the_car, files_on_the_workstation, sections
 from lanenet.errors import ConfigError, did_you_mean
 
 app = typer.Typer()

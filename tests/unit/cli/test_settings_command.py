@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lanenet.cli.app import app
-from lanenet.cli.shared.schemas import files_on_the_car, sections
+from lanenet.cli.schemas import files_on_the_car, sections
 from lanenet.config import load_settings
 
 
