@@ -131,7 +131,7 @@ def chessboard(
     epilog="Example: lanenet calibrate ground points.csv --camera runs/camera.yaml --out runs/camera.yaml"
 )
 def ground(
-    camera: Annotated[Path, typer.Option("--camera", help="Camera YAML, or ROS camera_info.")],
+    camera: Annotated[Path, typer.Option("--camera", help="Camera YAML, or one of ROS, OpenCV or Kalibr.")],
     out: _Out,
     points: Annotated[
         Path | None,
@@ -294,16 +294,19 @@ def print_(
 
 def _read_lens(path: Path) -> Camera:
     from lanenet.calibration.lens import NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM
-    from lanenet.data.camera_file import read_camera, read_ros_camera_info
+    from lanenet.data.camera_file import read_lens
     from lanenet.geometry.camera import Mounting
 
-    if path.is_file() and "camera_matrix" in read_yaml(path):
-        return read_ros_camera_info(path, Mounting(NOMINAL_HEIGHT_CM), NOMINAL_WHEELBASE_CM)
-    return read_camera(path)
+    return read_lens(path, Mounting(NOMINAL_HEIGHT_CM), NOMINAL_WHEELBASE_CM)
 
 
 def _figures(path: Path) -> dict[str, float]:
     """Return the lens's residuals, which stay valid when only the mounting changes."""
+    from lanenet.data.lens_file import foreign_lens
+
+    # Other programs' figures have other names.
+    if path.is_file() and foreign_lens(path) is not None:
+        return {}
     found = read_yaml(path).get("residuals") or {}
     lens = ("rms_px", "worst_view_rms_px", "views_count", "seen_angle_rad")
     return {name: float(found[name]) for name in found if name in lens or name.endswith("_sigma_px")}

@@ -1,9 +1,13 @@
-"""Camera files: lanenet's own YAML, and ROS ``camera_info`` YAML; both can be read and written."""
+"""Camera files: lanenet's own YAML and ROS ``camera_info`` YAML, read and written; lenses of others, read."""
 
 from __future__ import annotations
 
 import datetime
+import logging
 import math
+import shlex
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,9 +17,15 @@ from pydantic import ConfigDict, Field, field_validator
 
 from lanenet.config import Settings, SettingsT, check_settings, read_yaml
 from lanenet.data.files import write_text
+from lanenet.data.lens_file import foreign_lens
 from lanenet.errors import CalibrationError, ConfigError
 from lanenet.geometry.camera import Camera, CameraModel, Mounting
-from lanenet.reading import is_folder, is_regular
+from lanenet.reading import is_folder, is_regular, parsing, read_json
+
+_log = logging.getLogger(__name__)
+
+#: Name of the camera file in the folder of a map.
+MAP_CAMERA_NAME = "camera.yaml"
 
 #: Bounds of what a file may hold. Chosen: ten metres, since no car is larger; a right angle, beyond which a
 #: camera sees no road ahead and a number is one of degrees; and numbers of lenses whose powers stay finite.
@@ -112,26 +122,82 @@ class CameraFile(Settings):
 def read_camera(path: Path) -> Camera:
     """Read a camera file, or the camera of an earlier map of the same car.
 
+    That of a rejected map is taken with a warning in the log, whether the folder is given or the file in it.
+
     Args:
         path: The file, or the map's folder.
 
     Raises:
         CalibrationError: If the file is missing, of an unknown version, or a value is missing, misspelt or
-            impossible; names the file and the key. Or if the map was rejected.
+            impossible; names the file and the key.
     """
-    return _read(CameraFile, _camera_of_map(path) if is_folder(path) else path).camera()
-
-
-def _camera_of_map(folder: Path) -> Path:
-    meta = folder / "map.yaml"
-    if not is_regular(meta):
-        raise CalibrationError(f"{folder}: is a folder without map.yaml, expected a camera file or a map")
-    if read_yaml(meta, CalibrationError).get("verdict") == "reject":
-        raise CalibrationError(
-            f"{folder}: this map was rejected, so its camera may be wrong; expected a good or usable map, or "
-            "a camera file"
+    if is_folder(path):
+        if not is_regular(path / "map.yaml"):
+            raise CalibrationError(f"{path}: is a folder without map.yaml, expected a camera file or a map")
+        path = path / MAP_CAMERA_NAME
+    camera = read_own_camera(path)
+    if path.name == MAP_CAMERA_NAME and (why := _why_rejected(path.parent)) is not None:
+        _warn(
+            f"{path}: a doubtful camera is used: it is that of a rejected map, and wrong where it is the "
+            f"camera that spoiled the map{why}; lanenet calibrate measures it without a map"
         )
-    return folder / "camera.yaml"
+    return camera
+
+
+def read_own_camera(path: Path) -> Camera:
+    """Read the camera file of what is read as a whole; arguments and errors as for ``read_camera``."""
+    if is_regular(path) and (lens := foreign_lens(path)) is not None:
+        raise CalibrationError(
+            f"{path}: a camera file of {lens.program} holds the lens and no mounting above the road; measure "
+            f"the mounting: lanenet calibrate ground POINTS.csv --camera {shlex.quote(str(path))} --out "
+            "camera.yaml, and give that file"
+        )
+    return _read(CameraFile, path).camera()
+
+
+def read_lens(path: Path, mounting: Mounting, wheelbase_cm: float) -> Camera:
+    """Read the lens in a camera file of ROS, OpenCV or Kalibr, or in one of lanenet.
+
+    Args:
+        path: The file; or the folder of a map.
+        mounting: Pose above the road, where the file has none: only lanenet's has one.
+        wheelbase_cm: Distance between the car's axles, where the file has none.
+
+    Raises:
+        CalibrationError: If the file is missing, or a value is missing or impossible; names file and key.
+    """
+    lens = foreign_lens(path) if is_regular(path) else None
+    if lens is None:
+        return read_camera(path)
+    info = _checked(RosCameraInfo, lens.info, str(path))
+    _checked(MountingFile, {name: getattr(mounting, name) for name in MountingFile.model_fields}, "mounting")
+    _checked(CarFile, {"wheelbase_cm": wheelbase_cm}, "car")
+    return Camera(
+        model=_ROS_MODELS[info.distortion_model],
+        width=info.image_width,
+        height=info.image_height,
+        K=np.array(info.camera_matrix.data, dtype=np.float64).reshape(3, 3),
+        D=np.array(info.distortion_coefficients.data, dtype=np.float64),
+        mounting=mounting,
+        wheelbase_cm=wheelbase_cm,
+    )
+
+
+def _why_rejected(folder: Path) -> str | None:
+    """Return the verdict on a rejected map as the end of a sentence; None for any other folder."""
+    meta = folder / "map.yaml"
+    if not is_regular(meta) or read_yaml(meta, CalibrationError).get("verdict") != "reject":
+        return None
+    report = folder / "report.json"
+    with suppress(CalibrationError), parsing(str(report), CalibrationError):
+        return f" ({read_json(report, CalibrationError)['verdict']['sentence']})"
+    return ""
+
+
+@cache
+def _warn(text: str) -> None:
+    """Log a warning once: a command reads its camera several times."""
+    _log.warning(text)
 
 
 def write_camera(
@@ -227,31 +293,6 @@ class RosCameraInfo(Settings):
         if "distortion_model" in info.data:
             _checked_distortion(matrix.data, _ROS_MODELS[info.data["distortion_model"]])
         return matrix
-
-
-def read_ros_camera_info(path: Path, mounting: Mounting, wheelbase_cm: float) -> Camera:
-    """Read the YAML that ROS' ``camera_calibration`` writes.
-
-    Args:
-        path: The file.
-        mounting: Pose above the road, which is not in the file.
-        wheelbase_cm: Distance between the car's axles.
-
-    Raises:
-        CalibrationError: If the file is missing, or a value is missing or impossible; names file and key.
-    """
-    info = _read(RosCameraInfo, path)
-    _checked(MountingFile, {name: getattr(mounting, name) for name in MountingFile.model_fields}, "mounting")
-    _checked(CarFile, {"wheelbase_cm": wheelbase_cm}, "car")
-    return Camera(
-        model=_ROS_MODELS[info.distortion_model],
-        width=info.image_width,
-        height=info.image_height,
-        K=np.array(info.camera_matrix.data, dtype=np.float64).reshape(3, 3),
-        D=np.array(info.distortion_coefficients.data, dtype=np.float64),
-        mounting=mounting,
-        wheelbase_cm=wheelbase_cm,
-    )
 
 
 def write_ros_camera_info(path: Path, camera: Camera, name: str) -> None:

@@ -10,7 +10,7 @@ import yaml
 from bad_input import Bad, each
 from cameras import MOUNTING, ROS_FILE, make_camera
 
-from lanenet.data.camera_file import read_camera, read_ros_camera_info, write_camera
+from lanenet.data.camera_file import read_camera, read_lens, write_camera
 from lanenet.errors import CalibrationError
 from lanenet.geometry.camera import Mounting
 
@@ -41,7 +41,7 @@ def ros(old: str = "", new: str = "", mounting: Mounting = MOUNTING, wheelbase_c
     def act(tmp_path: Path) -> Any:
         path = tmp_path / "info.yaml"
         path.write_text(ROS_FILE.replace(old, new) if old else ROS_FILE)
-        return read_ros_camera_info(path, mounting, wheelbase_cm)
+        return read_lens(path, mounting, wheelbase_cm)
 
     return act
 
@@ -89,7 +89,7 @@ BAD = [
     bad("three coefficients", write_three, "camera.yaml", "key 'D'", "4 or 5", "found 3"),
     bad("no file", lambda folder: read_camera(folder / "camera.yaml"), "camera.yaml", "no such file"),
     bad("a name that no file can have", lambda folder: read_camera(folder / ("x" * 5000)), "xxx"),
-    bad("ros: another model", ros("plumb_bob", "rational_polynomial"), "info.yaml", "'distortion_model'"),
+    bad("ros: another model", ros("plumb_bob", "double_sphere"), "info.yaml", "'distortion_model'"),
     bad(
         "ros: coefficients of another model",
         ros("plumb_bob", "equidistant"),

@@ -27,7 +27,7 @@ from lanenet.calibration.chessboard import read_picture
 from lanenet.cli.calibrate import _read_points
 from lanenet.cli.train import run_settings_schema
 from lanenet.config import dump_settings, load_settings
-from lanenet.data.camera_file import read_camera, read_ros_camera_info, write_camera
+from lanenet.data.camera_file import read_camera, read_lens, write_camera
 from lanenet.data.drives import open_drive, read_truth
 from lanenet.data.drives.folder import TRUTH_NAMES, DriveWriter
 from lanenet.data.drives.sources import open_source, read_mask
@@ -222,7 +222,7 @@ READERS: dict[str, Reader] = {
         lambda f: write_camera(f / "camera.yaml", make_camera(), "by hand"),
         lambda f: read_camera(f / "camera.yaml").intersect_ground(np.zeros((4, 2))),
     ),
-    "ros camera": Reader(make_ros, lambda f: read_ros_camera_info(f / "info.yaml", Mounting(20.0), 26.0)),
+    "ros camera": Reader(make_ros, lambda f: read_lens(f / "info.yaml", Mounting(20.0), 26.0)),
     "folder": Reader(lambda f: write_drive(f / "drive", 3), lambda f: images(f / "drive")),
     "truth": Reader(make_truth, lambda f: read_truth(f / "drive")),
     "tub": Reader(
