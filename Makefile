@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 CONFIG ?= configs/small.yaml
+# The network of make train: never one of those that the project ships, which git would show as changed.
+NAME ?= my_$(basename $(notdir $(CONFIG)))
 # More arguments for pip, for example the package index of CPU-only PyTorch wheels.
 PIP_ARGS ?=
 
@@ -16,18 +18,19 @@ TEST_PROCESSES ?= auto
 # thread, so that the processes leave each other their cores. Neighbouring tests share a process and its
 # fixtures, until a process that has none left takes over some of another one's. Compiled modules are kept, even
 # where the environment forbids it (as many containers do): else each process, and each program that a test
-# starts, compiles them all again.
+# starts, compiles them all again. Each skip gives its reason, and a target whose tests were all skipped fails.
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
-  --jaxtyping-packages=lanenet,datagen,beartype.beartype \
+  --jaxtyping-packages=lanenet,datagen,beartype.beartype -rs --fail-on-skips all \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train general install env test test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-data real-drives test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
 
 help:
-	@echo "make train        environment, then everything that $(CONFIG) needs, into checkpoints/"
+	@echo "make train        environment, then a network from nothing by $(CONFIG), into checkpoints/$(NAME)/"
 	@echo "make general      the network for any car: simulated drives, and real ones of LIBRARY=drives.sqlite; hours"
 	@echo "make install      environment for mapping and training in $(VENV)"
 	@echo "make test         environment for developers, then the fast tests"
+	@echo "make test-data    the fast tests that need real drives (LANENET_SHARED_DATA)"
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  the wheel and the source archive in empty environments, with every Python there is"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of all but one config; two processes"
@@ -36,7 +39,7 @@ help:
 	@echo "make leaderboard  all detectors ranked by left-out track, from what make left-out measured"
 	@echo "make judge        both networks and all baselines on 160 roads in closed loop (goes on where it stopped)"
 	@echo "make screenshots  the report pages on a phone, in light and dark, into runs/screenshots (needs chromium)"
-	@echo "make fleet        sixty drives on a Ray cluster whose nodes are killed, against one process"
+	@echo "make fleet        drives on a Ray cluster whose nodes are killed, against one process"
 	@echo "make golden       two drives from recording to detections, against what they gave before"
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make donkeycar    the pilot in donkeycar 5.3's own vehicle, driven from its own page (needs python3.11)"
@@ -56,14 +59,14 @@ help:
 	@echo "make clean        remove caches and intermediate files; keeps checkpoints/ and $(VENV)"
 
 train: $(VENV)/.stamp-train
-	$(BIN)/lanenet train $(CONFIG)
+	$(BIN)/lanenet train $(CONFIG) name=$(NAME)
 
 # Real drives are those of a library (lanenet drives), with the maps of lanenet label-all where LABELLED says so; all
 # of a track in one part. GENERAL adds arguments, such as data.library.weight=0.3 or data.library.split=train.
 LIBRARY ?=
 LABELLED ?=
 general: $(VENV)/.stamp-train
-	$(BIN)/lanenet train configs/general.yaml $(if $(LIBRARY),name=general-real data.library.file=$(LIBRARY) \
+	$(BIN)/lanenet train configs/general.yaml name=$(if $(LIBRARY),general-real,my_general) $(if $(LIBRARY),data.library.file=$(LIBRARY) \
 	  $(if $(LABELLED),data.library.labelled=$(LABELLED))) $(GENERAL)
 
 install: $(VENV)/.stamp-train
@@ -73,12 +76,25 @@ env: $(VENV)/.stamp-dev
 test: $(VENV)/.stamp-dev
 	$(PYTEST) -m "not slow"
 
+# Real drives are not part of the repository: their folder is named, or lies beside the checkout.
+REAL_DRIVES := $(or $(LANENET_SHARED_DATA),$(wildcard $(dir $(CURDIR))shared/data))
+NEED_REAL_DRIVES = @test -d "$(REAL_DRIVES)" || \
+  { echo "error: needs real drives, but LANENET_SHARED_DATA names no folder of them" >&2; exit 1; }
+
+# What Donkeycar is needed for has a target of its own.
+test-data: $(VENV)/.stamp-dev
+	$(if $(REAL_DRIVES),LANENET_SHARED_DATA=$(REAL_DRIVES) $(PYTEST) --fail-on-skips any -m "data and not slow" \
+	  --ignore tests/contracts/test_donkeycar.py,@echo "nothing tested: LANENET_SHARED_DATA names no folder of real drives")
+
+real-drives:
+	@echo $(REAL_DRIVES)
+
 test-slow: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow
 
 # What the car installs, in an empty environment; fetches packages. One process, so that the release is built once.
 test-base-install: $(VENV)/.stamp-dev
-	$(PYTEST) -rs -m slow --dist loadfile tests/contracts/test_base_install.py
+	$(PYTEST) -m slow --dist loadfile tests/contracts/test_base_install.py
 
 # Each file stays in one process, for its fixtures. AlexNet takes its two steps by paper_split.yaml; by its own
 # config in make test-slow.
@@ -92,10 +108,11 @@ traps: $(VENV)/.stamp-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --folder runs/traps $(TRAPS)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps
 
-# Half an hour on one core, once configs/general.yaml has made its drives; needs the drives of configs/tubs.yaml.
+# Half an hour on one core, once make general has made its drives; needs the real ones of tests/configs/tubs.yaml.
 # LEFT_OUT adds arguments, such as --start checkpoints/mine.
 left-out: $(VENV)/.stamp-train
-	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_left_out.py --folder runs/left-out $(LEFT_OUT)
+	$(NEED_REAL_DRIVES)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_left_out.py --folder runs/left-out --data $(REAL_DRIVES) $(LEFT_OUT)
 
 # From the table of the line above, or from its page.
 leaderboard: $(VENV)/.stamp-train
@@ -114,9 +131,9 @@ judge: $(VENV)/.stamp-train
 screenshots: $(VENV)/.stamp-dev
 	LANENET_SCREENSHOTS=$(abspath runs/screenshots) $(PYTEST) tests/contracts/test_pages_in_browser.py
 
-# Needs LANENET_SHARED_DATA.
+# With LANENET_SHARED_DATA on real drives, too.
 fleet: $(VENV)/.stamp-dev
-	$(PYTEST) -rs -m slow --numprocesses 0 tests/sim/test_fleet_on_a_cluster.py
+	$(PYTEST) -m slow --numprocesses 0 tests/sim/test_fleet_on_a_cluster.py
 
 golden: $(VENV)/.stamp-dev
 	$(PYTEST) tests/golden
@@ -127,7 +144,7 @@ golden-renew: $(VENV)/.stamp-dev
 # Donkeycar pins Python and NumPy, hence an environment of its own. Another one: LANENET_DONKEYCAR=FOLDER make donkeycar
 LANENET_DONKEYCAR ?= $(abspath .venv-donkeycar)
 donkeycar: $(VENV)/.stamp-dev $(LANENET_DONKEYCAR)/.stamp
-	LANENET_DONKEYCAR=$(LANENET_DONKEYCAR) $(PYTEST) -rs --numprocesses 0 tests/contracts/test_donkeycar.py
+	LANENET_DONKEYCAR=$(LANENET_DONKEYCAR) $(PYTEST) --numprocesses 0 tests/contracts/test_donkeycar.py
 
 $(LANENET_DONKEYCAR)/.stamp: contrib/donkeycar.txt pyproject.toml $(KERNELS)
 	@command -v python3.11 >/dev/null || { echo "error: no python3.11 found, which donkeycar 5.3 needs" >&2; exit 1; }
@@ -136,7 +153,7 @@ $(LANENET_DONKEYCAR)/.stamp: contrib/donkeycar.txt pyproject.toml $(KERNELS)
 	touch $@
 
 # Maps the drive first, which takes some minutes, unless that was done before.
-DRIVE ?= $(LANENET_SHARED_DATA)/donkey_circuit
+DRIVE ?= $(REAL_DRIVES)/donkey_circuit
 LANE_WIDTH ?= 59
 SHOWN ?= 700:859
 pictures: $(VENV)/.stamp-train

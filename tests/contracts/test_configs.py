@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from lanenet.config import check_settings, load_settings, read_yaml
 from lanenet.errors import ConfigError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+#: Those that ship, and those of the tests.
+TRAINING_RUNS = sorted([*CONFIGS.glob("*.y*ml"), *(CONFIGS.parent / "tests" / "configs").glob("*.y*ml")])
 ALL_FILES = sorted(CONFIGS.rglob("*.y*ml"))
 
 
@@ -97,7 +100,7 @@ def test_every_shipped_config_loads(path: Path) -> None:
     READERS[kind](path)
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", TRAINING_RUNS, ids=lambda path: path.name)
 def test_a_training_run_is_named_after_its_file(path: Path) -> None:
     # checkpoints/<name>/ then tells which config made it, and two configs never share a folder.
     assert read_training_run(path).name == path.stem
@@ -163,17 +166,22 @@ def prepare_quickly(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(build, "refuse_leaks", lambda *_: ())
     data = read_training_run(path).data
     few = {"train": 2, "validation": 1, "test": 1} if data.synthetic.train else {}
-    data = data.model_copy(update={"synthetic": data.synthetic.model_copy(update=few), "workers": 1})
+    # Whoever uses the config has the drives, the tests have not.
+    drives = [
+        drive.model_copy(update={"path": write_recording(tmp_path / drive.path.name, lap(k, 40))})
+        for k, drive in enumerate(data.drives)
+    ]
+    synthetic = data.synthetic.model_copy(update=few)
+    data = data.model_copy(update={"synthetic": synthetic, "drives": tuple(drives), "workers": 1})
     prepared = build.prepare(data, tmp_path / "work")
-    drives = sum(drive.counts_as for drive in data.drives)
-    assert len(prepared.train) == few.get("train", 0) + drives
+    assert len(prepared.train) == few.get("train", 0) + len(drives)
     for role in ("validation", "test"):
         parts = prepared.of(role)
         assert parts and all(part.labels.is_file() for part in parts)
     return prepared
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", TRAINING_RUNS, ids=lambda path: path.name)
 def test_the_data_of_a_training_run_is_made(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,6 +208,22 @@ def test_make_trains_the_general_network_with_the_real_drives_of_a_library(tmp_p
     assert found == [("hall", "MIT", "train", 0.3), ("yard", "CC0-1.0", "train", 0.3)]
 
 
+@pytest.mark.parametrize("target", ["train", "general"])
+def test_make_trains_into_a_folder_that_git_ignores(target: str, tmp_path: Path) -> None:
+    """What ships is then neither replaced by a training nor taken for its result."""
+    command = ["make", "--dry-run", "--no-print-directory", "--assume-old=.venv/.stamp-train", target]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=CONFIGS.parent).stdout
+    config, *overrides = said.partition("lanenet train")[2].split()
+    settings: Any = load_settings(run_settings_schema(), CONFIGS.parent / config, overrides)
+    for folder in (settings.checkpoints_dir / settings.name, settings.work_folder):
+        # In a repository of its own: the tests also run where only the files are.
+        shutil.copy(CONFIGS.parent / ".gitignore", tmp_path)
+        subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+        subprocess.run(
+            ["git", "-C", tmp_path, "check-ignore", "--quiet", folder / "metrics.json"], check=True
+        )
+
+
 #: The others are trained by `make chain`, a stage of the gate, but for alexnet.yaml: its network is that of
 #: paper_split.yaml, too.
 FAST = ("small.yaml",)
@@ -209,7 +233,7 @@ FAST = ("small.yaml",)
     "path",
     [
         pytest.param(path, id=path.name, marks=[] if path.name in FAST else [pytest.mark.slow])
-        for path in sorted(CONFIGS.glob("*.y*ml"))
+        for path in TRAINING_RUNS
     ],
 )
 def test_a_training_run_takes_two_steps(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,7 +288,7 @@ def test_a_misspelt_key_is_named() -> None:
         check_settings(run_settings_schema(), {**data, "lern": {}}, "small.yaml")
 
 
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.y*ml")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", TRAINING_RUNS, ids=lambda path: path.name)
 def test_what_a_config_starts_from_fits_its_network_and_window(path: Path) -> None:
     from lanenet.learn.checkpoint import load_start_weights
     from lanenet.learn.network import new_network

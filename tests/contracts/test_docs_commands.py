@@ -30,7 +30,6 @@ from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import open_drive
 from lanenet.data.maps.joined import FORMAT, JoinedDrive, JoinedMeta, write_joined
 
-CONFIGS = sorted((REPO / "configs").glob("*.yaml"))
 COMMANDS = [command for document in DOCUMENTS for command in commands_of(document)]
 #: Fewer give no map.
 FRAMES = 60
@@ -106,7 +105,6 @@ def tiny(config: dict[str, Any]) -> dict[str, Any]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project folder with a small drive, its map, its labels, photos of a board and small configs."""
     project = tmp_path_factory.mktemp("documents") / "project"
-    documents = "".join(document.read_text(encoding="utf-8") for document in (*DOCUMENTS, *CONFIGS))
     shutil.copytree(REPO / "configs", project / "configs")
     shutil.copytree(REPO / "checkpoints", project / "checkpoints")
     for path in (project / "configs" / "judge").glob("*.yaml"):
@@ -123,12 +121,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             config = yaml.safe_load(path.read_text(encoding="utf-8"))
             if "data" in config:
                 path.write_text(yaml.safe_dump(tiny(config)), encoding="utf-8")
-            for shown in config.get("data", {}).get("drives", ()):
-                if shown["path"] in documents and not Path(shown["path"]).exists():
-                    width = f"track.lane_width_cm={shown['lane_width_cm']}"
-                    invoke(f"{example} frames={FRAMES} {width} --out {shown['path']}")
+        invoke(f"{example} frames={FRAMES} track.lane_width_cm=59 --out donkey_tub")
     drive = project / "runs" / "drive7"
-    count_from(940, project.parent / "shared" / "data" / "donkey_circuit" / "frames.csv")
+    # The line of the documents shows its last frames.
+    count_from(940, project / "donkey_tub" / "frames.csv")
     for name in ("my_tub", "other_tub", "monday_tub", "tuesday_tub"):
         shutil.copytree(drive, project / name)
     for name in ("my_tub", "other_tub"):
@@ -137,10 +133,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # Its drives lie relative to its folder, to which it is copied back.
     shutil.move(project / "drives.sqlite", project.parent)
     shutil.copytree(drive, project / "runs" / "drive8")
-    shutil.copytree(project / "runs" / "my_map", project / "runs" / "donkey_map")
     write_track(project / "runs" / "track", project / "runs" / "my_map")
-    shutil.copytree(project / "checkpoints" / "general", project / "checkpoints" / "donkey_circuit")
-    for copy in (project / "runs", project / "checkpoints" / "donkey_circuit"):
+    shutil.copytree(project / "checkpoints" / "general", project / "checkpoints" / "donkey")
+    for copy in (project / "runs", project / "checkpoints" / "donkey"):
         shutil.copy(drive / "camera.yaml", copy / "camera.yaml")
     shutil.copy(project / "checkpoints" / "small" / "model.onnx", project / "alexnet.onnx")
     shutil.copytree(project / "runs", project.parent / "runs")
@@ -241,7 +236,7 @@ def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPat
     # What the line before it in the README trains.
     shutil.rmtree("checkpoints/mycar", ignore_errors=True)
     if verb != "train":
-        shutil.copytree("checkpoints/donkey_circuit", "checkpoints/mycar")
+        shutil.copytree("checkpoints/donkey", "checkpoints/mycar")
     written = re.findall(r"--(?:out|video) (\S+)", line)
     if verb == "map":
         # The map of another drive would not be replaced.
@@ -259,19 +254,26 @@ def test_the_command_runs(line: str, folder: Path, monkeypatch: pytest.MonkeyPat
         assert newest > made_before - CLOCK_STEP_NS, f"{line}: did not write {path}"
 
 
-def test_the_moving_picture_shows_edges_and_no_photos(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_moving_picture_shows_photos_with_the_lane_beside_the_map(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """``make pictures`` without its map."""
     monkeypatch.chdir(folder)
-    for photos in ([], ["--photos"]):
-        out = folder / f"drive{len(photos)}.webp"
-        words = [str(folder.parent / "runs" / "my_map"), str(out), "--frames", "10:15", *photos]
-        monkeypatch.setattr("sys.argv", ["pictures.py", *words])
-        runpy.run_path(str(REPO / "contrib" / "pictures.py"), run_name="__main__")
-        with Image.open(out) as picture:
-            assert picture.n_frames == 3
-            left = np.asarray(picture.convert("L"))[:, : picture.width // 2]
-        # Where there is no edge, all is dark.
-        assert (np.median(left) > 40) == bool(photos)
+    out = folder / "drive.webp"
+    words = [str(folder.parent / "runs" / "my_map"), str(out), "--frames", "10:15"]
+    monkeypatch.setattr("sys.argv", ["pictures.py", *words])
+    runpy.run_path(str(REPO / "contrib" / "pictures.py"), run_name="__main__")
+    with Image.open(out) as picture:
+        assert picture.n_frames == 3
+        image, view = np.split(np.asarray(picture.convert("RGB")).astype(int), [3 * 320], axis=1)
+    for part in (image, view):
+        # The network's lines: green on the left, orange on the right.
+        red, green, blue = (part[..., k] for k in range(3))
+        left = np.argwhere((green > red + 60) & (green > blue + 60))
+        right = np.argwhere((red > green + 60) & (green > blue + 40))
+        assert len(left) > 20 and len(right) > 20
+    # The image is dark, the map pale.
+    assert np.median(image) < 200 < np.median(view)
 
 
 @pytest.mark.parametrize("command", LEFT_OUT, ids=lambda command: command.line)
@@ -302,6 +304,10 @@ def test_every_reason_is_needed() -> None:
 def test_most_commands_of_lanenet_are_run() -> None:
     verbs = {line.split()[1] for line in RUN}
     assert {names[0] for names in VERBS} - verbs == {"join", "stop"}
+
+
+def test_commands_read_and_write_below_the_folder_they_run_in() -> None:
+    assert not [command for command in COMMANDS if "../" in command.line]
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(REPO).as_posix())

@@ -8,12 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from lanenet.cli.train import run_settings_schema
+from lanenet.config import load_settings
 from lanenet.errors import LanenetError
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "bench"))
 
 from bench_leaderboard import WITHOUT, report, results_of_page, results_of_table, times_worse  # noqa: E402
+from bench_left_out import LEARN_ON, MORE, real_drives  # noqa: E402
 
 PAGE = (ROOT / "docs" / "results" / "left-out.md").read_text(encoding="utf-8")
 
@@ -67,3 +70,13 @@ def test_a_page_of_something_else_is_refused(tmp_path):
         report("# Something else", tmp_path / "none.csv")
     with pytest.raises(LanenetError, match="expected the table"):
         results_of_page("# Something else")
+
+
+def test_what_is_left_out_and_learned_on_is_read_from_the_configs():
+    settings = load_settings(run_settings_schema(), ROOT / "configs" / "general.yaml", [*LEARN_ON])
+    assert settings.data.synthetic.train == 240 and settings.learn.augment.scale == 0.2
+    tubs = load_settings(run_settings_schema(), ROOT / "tests" / "configs" / "tubs.yaml")
+    drives = real_drives(tubs.data, Path("drives"))
+    assert [drive.path.parent for drive in drives] == [Path("drives")] * 4
+    assert {drive.path.name for drive in drives} == {"donkey_circuit", "usi_mat", "garage_tape", *MORE}
+    assert {(drive.split, drive.counts_as) for drive in drives} == {("train", 15)}

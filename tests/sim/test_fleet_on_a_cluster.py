@@ -1,4 +1,4 @@
-"""Sixty drives on a cluster whose machines are killed meanwhile, against one process (``make fleet``)."""
+"""Drives on a cluster whose machines are killed meanwhile, against one process (``make fleet``)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from fleet_drives import cut_tub, sixty_drives
+from fleet_drives import cut_tub, simulated_drives, sixty_drives
 
 from datagen.fleet.checksums import with_checksums
 from datagen.fleet.local_engine import LocalEngine
@@ -22,8 +22,8 @@ from datagen.fleet.task import FleetDrive, FleetSettings
 
 pytestmark = pytest.mark.slow
 
-#: How often a machine is killed, and the seed of when and which.
-KILLS, SEED = 3, 26
+#: Seed of when a machine is killed, and which.
+SEED = 26
 KINDS = ("maps", "labels", "cameras", "tracks")
 
 
@@ -67,13 +67,31 @@ def contents(out: Path) -> dict[str, bytes]:
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_sixty_drives_on_two_machines_of_which_three_are_killed(
     shared_data: Path, tmp_path: Path, machines: TwoMachines, capsys: pytest.CaptureFixture[str]
-):
-    drives = sixty_drives(shared_data, tmp_path / "drives")
-    assert len(drives) == 60
+) -> None:
+    same_as_alone(sixty_drives(shared_data, tmp_path / "drives"), 3, tmp_path, machines, capsys)
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_simulated_drives_on_two_machines_of_which_one_is_killed(
+    tmp_path: Path, machines: TwoMachines, capsys: pytest.CaptureFixture[str]
+) -> None:
+    same_as_alone(simulated_drives(6, tmp_path / "drives"), 1, tmp_path, machines, capsys)
+
+
+def same_as_alone(
+    drives: list[FleetDrive],
+    kills: int,
+    tmp_path: Path,
+    machines: TwoMachines,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Label drives on a cluster with kills, and again, and in one process: all is done once and alike."""
+    count = len(drives)
     storage, settings = Storage(str(tmp_path / "cluster")), FleetSettings()
     checked = with_checksums(drives, storage)
     rng = random.Random(SEED)
-    kill_at = rng.sample(range(3, 50), KILLS)
+    # Neither before the machines are at work nor when the rest is.
+    kill_at = rng.sample(range(max(1, count // 20), count - count // 6), kills)
 
     def maybe_kill(counts: Counts) -> None:
         if counts.ended in kill_at:
@@ -88,17 +106,17 @@ def test_sixty_drives_on_two_machines_of_which_three_are_killed(
         result = label_all(checked, settings, storage, engine, maybe_kill)
         took_s = time.monotonic() - begun_s
         alone = in_one_process.result()
-    assert machines.killed == KILLS
+    assert machines.killed == kills
     verdicts = Counter(drive.verdict for drive in result.drives)
     assert set(verdicts) <= {"good", "usable", "reject", "refused"} and verdicts["good"] > 0, verdicts
-    assert verdicts.total() == 60 and all(drive.new for drive in result.drives)
+    assert verdicts.total() == count and all(drive.new for drive in result.drives)
 
     # None is there twice, and nothing else is there.
     with_map = {drive.map_key for drive in result.drives}
     with_labels = {drive.labels_key for drive in result.drives if drive.labelled is not None}
     assert {path.name for path in (tmp_path / "cluster" / "maps").iterdir()} == with_map
     assert {path.name for path in (tmp_path / "cluster" / "labels").iterdir()} == with_labels
-    assert len(with_map) == 60
+    assert len(with_map) == count
 
     begun_s = time.monotonic()
     again = label_all(with_checksums(drives, storage), settings, storage, engine)
@@ -108,7 +126,7 @@ def test_sixty_drives_on_two_machines_of_which_three_are_killed(
 
     assert [drive.verdict for drive in alone.drives] == [drive.verdict for drive in result.drives]
     assert contents(tmp_path / "cluster") == contents(tmp_path / "alone")
-    said = f"60 drives, {dict(verdicts)}: {took_s:.0f} s with {KILLS} kills; again {again_s:.2f} s"
+    said = f"{count} drives, {dict(verdicts)}: {took_s:.0f} s with {kills} kills; again {again_s:.2f} s"
     with capsys.disabled():
         print(f"\n{said}")  # noqa: T201
 

@@ -1,4 +1,4 @@
-"""Sixty short drives for a fleet: simulated, cut out of real tubs, and as people record those."""
+"""Short drives for a fleet: simulated, cut out of real tubs, and as people record those."""
 
 from __future__ import annotations
 
@@ -45,12 +45,17 @@ def cut_tub(tub: Path, out: Path, first: int, frames: int) -> Path:
     return out
 
 
-def sixty_drives(shared_data: Path, folder: Path) -> list[FleetDrive]:
-    """Write the drives below a folder."""
-    drives = [
+def simulated_drives(count: int, folder: Path) -> list[FleetDrive]:
+    """Simulate drives below a folder."""
+    return [
         FleetDrive(f"sim-{k}", str(short_drive(k, folder / f"sim-{k}")), "", _SIMULATED_CM)
-        for k in range(1, SIMULATED + 1)
+        for k in range(1, count + 1)
     ]
+
+
+def sixty_drives(shared_data: Path, folder: Path) -> list[FleetDrive]:
+    """Write simulated and real drives below a folder."""
+    drives = simulated_drives(SIMULATED, folder)
     for tub, width_cm in TUBS_CM.items():
         with_gaps = folder / f"{tub}-with-gaps"
         program = shared_data.parent / "tools" / "as_people_record.py"
