@@ -103,9 +103,10 @@ class DetectionTable:
             "c": "centimetre",
             "_u_px": "pixel",
             "_v_px": "pixel",
-            "_a_px": "1/pixel",
-            "_b_px": "1",
-            "_c_px": "pixel",
+            "_a_px": "1/pixel^2",
+            "_b_px": "1/pixel",
+            "_c_px": "1",
+            "_d_px": "pixel",
         }
         write_parquet(path, arrays, {"format": FORMAT, "units": units})
 

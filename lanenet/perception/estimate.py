@@ -52,7 +52,7 @@ class LaneEstimate:
     presence: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(len(SIDES), np.nan))
     own_lane: float = float("nan")
     centre_line_cm: Float[np.ndarray, "3 2"] | None = None
-    lines_px: Float[np.ndarray, "2 7"] | None = None
+    lines_px: Float[np.ndarray, "2 8"] | None = None
 
     @property
     def mask(self) -> np.ndarray:

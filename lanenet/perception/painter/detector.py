@@ -64,11 +64,10 @@ class PainterSettings(Settings):
     """Pentek's painter; the defaults are the paper's where it gives one.
 
     Attributes:
-        scene: Without a camera: ``road`` takes the region of interest from the vanishing point of the image
-            and, where a settings file does not say otherwise, the settings of
-            :data:`lanenet.perception.painter.scene.ROAD`; ``model_car`` takes the proportions of a road
-            image and these defaults; ``auto`` takes ``road`` once the segments of a drive's frames meet in
-            a point.
+        scene: Without a camera: ``road`` takes the region of interest from the vanishing point and, where a
+            settings file does not say otherwise, :data:`lanenet.perception.painter.scene.ROAD`; ``floor``
+            takes the proportions of a road image and the defaults below; ``auto`` takes ``road`` once the
+            straight lines of a drive's frames meet in a point.
         mode: ``photo`` takes each frame by itself, ``video`` averages the lines over frames.
         video_weight: ``video``: weight of the current frame in the average.
         hold_frames: ``video``: a line is drawn and expected for so many frames after it was last found.
@@ -81,7 +80,7 @@ class PainterSettings(Settings):
         evidence: What a line has to show before it is answered.
     """
 
-    scene: Literal["auto", "road", "model_car"] = "auto"
+    scene: Literal["auto", "road", "floor"] = "auto"
     mode: Literal["photo", "video"] = "video"
     video_weight: float = Field(default=0.5, gt=0.0, le=1.0)
     hold_frames: int = Field(default=5, ge=0)
@@ -168,11 +167,11 @@ class LanePainter:
         if self.camera is not None or self._frames == 0:
             return ""
         roads = self._frames_of_roads
-        scene = "model_car" if 2 * roads > self._frames else "road"
+        scene = "floor" if 2 * roads > self._frames else "road"
         return (
-            f"without a camera file, the painter took {roads} of {counted(self._frames, 'frame')} for a "
-            "full-size road, whose straight lines meet in a point, and else the settings for model cars; "
-            f"'scene: {scene}' in a settings file (--config) chooses for all"
+            f"without a camera file, the painter took {roads} of {counted(self._frames, 'frame')} for a road "
+            "that runs to a horizon, where straight lines meet, and the others for a floor, where a line "
+            f"needs more evidence; 'scene: {scene}' in a settings file (--config) decides for all"
         )
 
     def detect(self, frame_bgr: UInt8[np.ndarray, "h w *c"]) -> LaneEstimate:
@@ -214,7 +213,7 @@ class LanePainter:
         settings = self.settings
         is_road = settings.scene == "road"
         trapezoid = find_trapezoid(width, height, self.camera, settings.edges)
-        if self.camera is None and settings.scene != "model_car" and settings.edges.trapezoid is None:
+        if self.camera is None and settings.scene != "floor" and settings.edges.trapezoid is None:
             self._vanishing.see(frame_bgr, settings.edges)
             if self._vanishing.point_px is not None:
                 is_road = True

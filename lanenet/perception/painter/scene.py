@@ -1,4 +1,4 @@
-"""The scene of an image without a camera file: a full-size road seen by a level camera, or something else.
+"""The scene of an image without a camera file: a road that runs to a horizon, or something else.
 
 The lines of a road, its kerbs, barriers and neighbouring lanes run ahead, so that most of its straight
 segments meet in one point of the horizon. That point tells the scene, and it places the region of interest:
@@ -22,7 +22,7 @@ from lanenet.perception.painter.lines import (
     value_channel,
 )
 
-#: The painter's settings on a full-size road, where a settings file does not say otherwise. Chosen on half of
+#: The painter's settings on such a road, where a settings file does not say otherwise. Chosen on half of
 #: the 30 road images of ``tests/support/road_labels.csv``, cropped, scaled, darkened and blurred, too. Most
 #: misses were lines without the evidence that keeps the painter from finding lanes in carpets.
 ROAD: dict[str, Any] = {
@@ -160,17 +160,17 @@ def _votes(segments: Float[np.ndarray, "n 4"], aspect: float) -> Float[np.ndarra
         First those of the segments whose lines pass it, then those of all that reach below it; each of the
         segments that rise to the right, then of those that fall.
     """
-    x1, y1, x2, y2 = segments.T
-    dx, dy = x2 - x1, aspect * (y2 - y1)
+    # Single precision takes a third of the time, and a vote needs no more.
+    x1, y1, x2, y2 = segments.astype(np.float32).T
+    dx, dy = x2 - x1, np.float32(aspect) * (y2 - y1)
     run = np.hypot(dx, dy)
     weight = np.sqrt(run / aspect)
-    u, v = _U_SHARES[None, :, None], _V_SHARES[:, None, None]
-    missed = (dy * (u - x1) - dx * aspect * (v - y1)) / run
+    u, v = (x.astype(np.float32) for x in (_U_SHARES[None, :, None], _V_SHARES[:, None, None]))
+    missed = (dy * (u - x1) - dx * np.float32(aspect) * (v - y1)) / run
     # All of the segment is on the road, below the point.
     below = np.minimum(y1, y2) >= v - _MISS_SHARE
-    passing = weight * below * np.exp(-0.5 * (missed / _MISS_SHARE) ** 2)
-    reaching = np.broadcast_to(weight * (np.maximum(y1, y2) > v), passing.shape)
+    passing = below * np.exp(-0.5 * (missed / _MISS_SHARE) ** 2)
+    reaching = np.broadcast_to(np.maximum(y1, y2) > v, passing.shape)
     rising = dx * dy < 0.0
-    return np.array(
-        [[kind[..., side].sum(axis=-1) for side in (rising, ~rising)] for kind in (passing, reaching)]
-    )
+    sides = np.stack([weight * rising, weight * ~rising])
+    return np.moveaxis(np.stack([passing @ sides.T, reaching @ sides.T]), -1, 1)

@@ -101,7 +101,7 @@ def test_an_empty_table(tmp_path: Path, name: str) -> None:
 def test_lines_of_the_image_are_written_in_pixels(tmp_path: Path, name: str) -> None:
     # A detector that works on the image and finds a line on the right only, then none.
     lines_px = np.full((2, len(LINE_PX_NAMES)), np.nan)
-    lines_px[1] = [600.0, 479.0, 330.0, 250.0, 1e-4, 1.1, 50.0]
+    lines_px[1] = [600.0, 479.0, 330.0, 250.0, 1e-6, 1e-4, 1.1, 50.0]
     table = make_table()
     table.add(8, 0.4, LaneEstimate(lines_px=lines_px))
     table.add(9, 0.45, LaneEstimate(lines_px=np.full_like(lines_px, np.nan)))
