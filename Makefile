@@ -81,6 +81,8 @@ REAL_DRIVES := $(or $(LANENET_SHARED_DATA),$(wildcard $(dir $(CURDIR))shared/dat
 NEED_REAL_DRIVES = @test -d "$(REAL_DRIVES)" || \
   { echo "error: needs real drives, but LANENET_SHARED_DATA names no folder of them" >&2; exit 1; }
 
+test-slow golden golden-renew fleet: export LANENET_SHARED_DATA := $(REAL_DRIVES)
+
 # What Donkeycar is needed for has a target of its own.
 test-data: $(VENV)/.stamp-dev
 	$(if $(REAL_DRIVES),LANENET_SHARED_DATA=$(REAL_DRIVES) $(PYTEST) --fail-on-skips any -m "data and not slow" \
@@ -131,7 +133,6 @@ judge: $(VENV)/.stamp-train
 screenshots: $(VENV)/.stamp-dev
 	LANENET_SCREENSHOTS=$(abspath runs/screenshots) $(PYTEST) tests/contracts/test_pages_in_browser.py
 
-# With LANENET_SHARED_DATA on real drives, too.
 fleet: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow --numprocesses 0 tests/sim/test_fleet_on_a_cluster.py
 

@@ -1,7 +1,7 @@
 """Do the golden runs again and replace what is expected of them; prints what changed, for the commit message.
 
 On purpose only: ``make golden-renew``, or ``python tests/golden/renew.py [simulated] [recorded]``. The
-real drive is looked for where the tests look for it, and its run is left as it is without.
+real drive is one of those in LANENET_SHARED_DATA, and its run is left as it is without.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from tolerances import TOLERANCES
 
 def main(names: list[str]) -> None:
     """Renew some runs, or all."""
-    default = golden_runs.ROOT.parent / "shared" / "data"
-    shared = Path(os.environ.get("LANENET_SHARED_DATA", default))
+    shared = Path(os.environ.get("LANENET_SHARED_DATA") or "nowhere")
     manifest = json.loads(golden_runs.MANIFEST.read_text()) if golden_runs.MANIFEST.exists() else {}
     for name in names or list(golden_runs.RUNS):
         inputs = [shared] if name == "recorded" else []
         if inputs and not (shared / "donkey_circuit").is_dir():
-            print(f"{name}: left as it is, no donkey_circuit in {shared}")  # noqa: T201
+            print(f"{name}: left as it is, no donkey_circuit in {shared} (LANENET_SHARED_DATA)")  # noqa: T201
             continue
         with tempfile.TemporaryDirectory() as folder:
             work = Path(folder)
