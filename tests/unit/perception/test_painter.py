@@ -25,7 +25,8 @@ from lanenet.perception.painter.curves import (
     move_lines,
     slide_windows,
 )
-from lanenet.perception.painter.detector import LanePainter, PainterSettings, find_aim_cm, measure_lane
+from lanenet.perception.painter.detector import LanePainter, PainterSettings
+from lanenet.perception.painter.lane import find_aim_cm, measure_lane
 from lanenet.perception.painter.lines import (
     EdgeField,
     EvidenceSettings,
