@@ -153,6 +153,12 @@ def _exif(data: bytes) -> bytes:
     return exif if exif.startswith(_TIFF) else b""
 
 
+def scan_count(data: bytes) -> int:
+    """Return how many times a JPEG goes over its pixels; 0 for other formats."""
+    # Within a scan, every 255 is followed by another byte; thumbnails have their own.
+    return data.count(b"\xff\xda") if data.startswith(b"\xff\xd8") else 0
+
+
 def is_cut_off(data: bytes) -> bool:
     """Tell whether a JPEG or PNG ends too early."""
     if data.startswith(b"\xff\xd8"):

@@ -10,8 +10,10 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import stat
 import struct
+import threading
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +21,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lanenet.errors import LanenetError
-from lanenet.image_header import as_stored, image_size, is_cut_off, orientation
+from lanenet.image_header import as_stored, image_size, is_cut_off, orientation, scan_count
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,14 +31,15 @@ MEBIBYTE = 2**20
 #: Chosen: lists in JSON take about twenty times their text in memory, so 32 MB stay below a gigabyte. The
 #: largest files, the lane lines of an hour's drive, have 2 MB.
 MAX_JSON = 32 * MEBIBYTE
-#: What a packed file may stand for: so much, and so many times its size. Chosen: label sets unpack to 2 to 20
-#: times their size, small ones of a still car, and images of flat colours, to more.
-_MAX_UNPACKED, _MAX_RATIO = 256 * MEBIBYTE, 100
+#: What a parser may ask for beside what it unpacks, [B]; chosen: pages and stacks. And one limit at a time.
+_SLACK, _LIMITING = 64 * MEBIBYTE, threading.Lock()
 #: A photo, or an image of a drive. Chosen: above the 30 MB of a phone's best JPEG.
 MAX_IMAGE = 64 * MEBIBYTE
 #: Of an image. Chosen: above the 50 megapixels of a phone; 192 MB decoded.
 MAX_PIXELS = 64 * 10**6
 
+#: Of a progressive JPEG, each of which takes as long as the whole image. Chosen: encoders write up to 14.
+_MAX_SCANS = 64
 #: What each orientation of Exif takes: exchange rows and columns, then top and bottom, then left and right.
 _TURNS = {
     **{1: (False, False, False), 2: (False, False, True), 3: (False, True, True), 4: (False, True, False)},
@@ -109,15 +112,36 @@ def is_folder(path: Path) -> bool:
         return False
 
 
-def most_unpacked(size: int) -> int:
-    """Return how much a packed file of some size may stand for, [B]."""
-    return _MAX_UNPACKED + _MAX_RATIO * size
-
-
 def natural_key(name: object) -> list[tuple[int, int, str]]:
     """Return the sort key of a name by which 2 comes before 10, as people count."""
     parts = re.split(r"([0-9]+)", str(name))
     return [(0, int(part), "") if k % 2 else (1, 0, part) for k, part in enumerate(parts)]
+
+
+@contextmanager
+def memory_limit(most: int) -> Iterator[None]:
+    """Bound what a parser may ask for beyond what the process has: many allocate what a file claims.
+
+    Where the kernel does not say how much that is, as on macOS, there is no bound.
+
+    Args:
+        most: Further memory, [B].
+    """
+    statm = Path("/proc/self/statm")
+    with _LIMITING:
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        try:
+            pages = int(statm.read_text().split()[0])
+        except OSError:
+            yield
+            return
+        limit = pages * resource.getpagesize() + most + _SLACK
+        known = [value for value in (soft, hard) if value != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min([limit, *known]), hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 @contextmanager
@@ -252,6 +276,8 @@ def decode_image(
     if not data:
         raise error(f"{where}: the image file is empty")
     size = image_size(data)
+    if (scans := scan_count(data)) > _MAX_SCANS:
+        raise error(f"{where}: a JPEG of {scans} scans, expected at most {_MAX_SCANS}")
     if size is not None and size[0] * size[1] > MAX_PIXELS:
         raise error(
             f"{where}: image of {size[0]}x{size[1]} px, expected at most {MAX_PIXELS // 10**6} megapixels"

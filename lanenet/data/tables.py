@@ -25,7 +25,14 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.files import atomic_file, require, write_text
 from lanenet.errors import DriveFormatError, LabelFormatError, LanenetError, MapFormatError, did_you_mean
-from lanenet.reading import MEBIBYTE, first_line, is_regular, open_regular, parsing
+from lanenet.reading import (
+    MEBIBYTE,
+    first_line,
+    is_regular,
+    memory_limit,
+    open_regular,
+    parsing,
+)
 
 _INT64_MAX = 2**63 - 1
 #: Numbers above this are written in full: nine digits would lose the microseconds of Unix time.
@@ -37,13 +44,11 @@ _MAX_RECORD = 2**18
 _ARRAYS = {"float": "d", "int": "q"}
 #: Of a Parquet file. Chosen: a day of driving, and twenty times the columns of a label set.
 _MAX_ROWS, _MAX_COLUMNS = 5_000_000, 1000
-#: Texts and lists in a Parquet file's footer, [B]; chosen: the widest table's footer is far smaller.
-_MAX_FOOTER = 16 * MEBIBYTE
 #: What a Parquet file may unpack to: so much, and so many times its size. Chosen: label sets unpack to 2 to
 #: 20 times their size, small ones of a still car to more.
-_MAX_UNPACKED, _MAX_RATIO = 256 * MEBIBYTE, 100
-#: Rows that are unpacked at a time, before the limit is checked.
-_BATCH_ROWS = 64
+_MAX_UNPACKED, _MAX_RATIO = 192 * MEBIBYTE, 100
+#: Texts and lists in a Parquet file's footer, [B]; chosen: the widest table's footer is far smaller.
+_MAX_FOOTER = 16 * MEBIBYTE
 #: Largest place [cm] or unwrapped heading [rad] of a table. Chosen: ten kilometres, or as many turns; squares
 #: of more would lose the centimetres.
 MAX_PLACE = 1e6
@@ -481,7 +486,7 @@ def _open_parquet(path: Path) -> Any:
     """Open a Parquet file; refuse more rows and columns than a table may have."""
     parquet = require("pyarrow.parquet", "data")
     limits = {"thrift_string_size_limit": _MAX_FOOTER, "thrift_container_size_limit": _MAX_FOOTER}
-    file = parquet.ParquetFile(path, page_checksum_verification=True, **limits)
+    file = parquet.ParquetFile(path, page_checksum_verification=True, pre_buffer=False, **limits)
     about = file.metadata
     if about.num_columns > _MAX_COLUMNS or about.num_rows > _MAX_ROWS:
         file.close()
@@ -496,30 +501,39 @@ def _bounded_table(path: Path, group: int | None, columns: Callable[[str], bool]
     """Read a Parquet file, as far as it may be unpacked; a few bytes can stand for any number of rows."""
     arrow = require("pyarrow", "data")
     size = path.stat().st_size
-    with _open_parquet(path) as file:
-        about = file.metadata
-        groups = list(range(about.num_row_groups)) if group is None else [group]
-        names = None if columns is None else [name for name in file.schema_arrow.names if columns(name)]
-        # Not by the columns: pyarrow 26 ends the process when a column's statistics are damaged.
-        packed = sum(about.row_group(number).total_byte_size for number in groups)
-        most = _MAX_UNPACKED + _MAX_RATIO * size
-        batches, unpacked = [], 0
-        schema = file.schema_arrow
-        if names is not None:
-            schema = arrow.schema([schema.field(name) for name in names], schema.metadata)
-        if packed <= most:
-            for batch in file.iter_batches(batch_size=_BATCH_ROWS, row_groups=groups, columns=names):
-                batches.append(batch)
-                unpacked += batch.nbytes
-                if unpacked > most:
-                    break
-        if max(packed, unpacked) > most:
-            raise ValueError(
-                f"{size / MEBIBYTE:.1f} MB stand for {max(packed, unpacked) / MEBIBYTE:.0f} MB and more, "
-                f"expected at most {most / MEBIBYTE:.0f} MB"
-            )
-        table = arrow.Table.from_batches(batches, schema=schema)
+    most = _MAX_UNPACKED + _MAX_RATIO * size
+    pool = arrow.default_memory_pool()
+    # The memory that a run of one value stands for is asked for at once, whatever the footer says. Arrow's
+    # own pool takes a gigabyte of addresses in advance.
+    arrow.set_memory_pool(arrow.system_memory_pool())
+    try:
+        with memory_limit(most), _open_parquet(path) as file:
+            table = _whole_table(file, group, columns, size, most)
+    except MemoryError:
+        raise ValueError(f"{size / MEBIBYTE:.1f} MB stand for more than {most / MEBIBYTE:.0f} MB") from None
+    finally:
+        arrow.set_memory_pool(pool)
     table.validate(full=True)
+    return table
+
+
+def _whole_table(
+    file: Any, group: int | None, columns: Callable[[str], bool] | None, size: int, most: int
+) -> Any:
+    """Read row groups of an open file, unless it says itself that they are too large."""
+    about = file.metadata
+    groups = list(range(about.num_row_groups)) if group is None else [group]
+    names = None if columns is None else [name for name in file.schema_arrow.names if columns(name)]
+    # Not by the columns: pyarrow 26 ends the process when a column's statistics are damaged.
+    unpacked = sum(about.row_group(number).total_byte_size for number in groups)
+    if unpacked <= most:
+        table = file.read_row_groups(groups, columns=names, use_threads=False)
+        unpacked = table.nbytes
+    if unpacked > most:
+        raise ValueError(
+            f"{size / MEBIBYTE:.1f} MB stand for {unpacked / MEBIBYTE:.0f} MB, expected at most "
+            f"{most / MEBIBYTE:.0f} MB"
+        )
     return table
 
 

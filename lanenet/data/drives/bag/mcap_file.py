@@ -20,12 +20,17 @@ from typing import Any, BinaryIO
 from lanenet.data.drives.bag.topic import MAX_STORAGE, Messages, Topic
 from lanenet.data.files import require
 from lanenet.errors import DriveFormatError
-from lanenet.reading import MEBIBYTE, most_unpacked, open_regular
+from lanenet.reading import MEBIBYTE, open_regular
 
 _SIGN = b"\x89MCAP0\r\n"
 #: Of a chunk, unpacked. Chosen: writers begin a new one after a megabyte, or after one message that is
-#: larger, and an image of 20 megapixels without loss has 60 MB.
-_MAX_CHUNK = 64 * MEBIBYTE
+#: larger, and an image of 16 megapixels without loss has 48 MB.
+_MAX_CHUNK = 48 * MEBIBYTE
+#: Of zstd; the most that its command unpacks without being asked, 128 MB.
+_MAX_WINDOW = 2**27
+#: Of all chunks: so much, and so many times the file's size. Chosen: images of a simulator, without loss and
+#: of flat colours, unpack to 100 times their size; a gigabyte takes a second.
+_MAX_UNPACKED, _MAX_RATIO = 1024 * MEBIBYTE, 200
 #: Messages that wait, since a later chunk may hold earlier ones. Chosen: writers' chunks overlap by a few.
 _MAX_WAITING = 96 * MEBIBYTE
 #: A message takes at least so many bytes of the file. Chosen: its entry in the index of its chunk has 16, and
@@ -95,6 +100,11 @@ class _McapMessages:
     size: int
     summary: Any
 
+    @property
+    def _most(self) -> int:
+        """What the chunks may unpack to together, [B]."""
+        return _MAX_UNPACKED + _MAX_RATIO * self.size
+
     def __call__(self, topic: str, from_ns: int | None) -> Iterator[tuple[int, bytes]]:
         """Yield time of recording, [ns], and bytes of a topic's messages, in the order of time."""
         channels = {channel.id for channel in self.summary.channels.values() if channel.topic == topic}
@@ -124,7 +134,7 @@ class _McapMessages:
         """Yield the first time and the unpacked records of each chunk with such channels since a time."""
         records = require("mcap.records", "bags")
         stream_of = require("mcap.data_stream", "bags").ReadDataStream
-        most = most_unpacked(self.size)
+        most = self._most
         indexes = sorted(self.summary.chunk_indexes, key=lambda index: index.message_start_time)
         if not indexes:
             yield from self._records_in_order(most)
@@ -152,7 +162,7 @@ class _McapMessages:
                 head = _HEAD.pack(record.channel_id, record.sequence, record.log_time, record.publish_time)
                 data = _RECORD.pack(_MESSAGE, len(head) + len(record.data)) + head + record.data
             if (most := most - len(data)) < 0:
-                self._refuse_size(most_unpacked(self.size) - most, most_unpacked(self.size))
+                self._refuse_size(self._most - most, self._most)
             if data:
                 yield 0, data
 
@@ -163,7 +173,7 @@ class _McapMessages:
         if not chunk.compression:
             data = chunk.data
         elif chunk.compression == "zstd":
-            unpacker = require("zstandard", "bags").ZstdDecompressor(max_window_size=_MAX_CHUNK)
+            unpacker = require("zstandard", "bags").ZstdDecompressor(max_window_size=_MAX_WINDOW)
             data = unpacker.stream_reader(io.BytesIO(chunk.data)).read(size + 1)
         elif chunk.compression == "lz4":
             data = require("lz4.frame", "bags").LZ4FrameDecompressor().decompress(chunk.data, size + 1)

@@ -102,10 +102,10 @@ class Decoder:
         message = self.message(data)
         with reading(Path(str(where))):
             pixels = message.data
-            pixels = base64.b64decode(pixels) if isinstance(pixels, str) else bytes(pixels)
+            pixels = base64.b64decode(pixels) if isinstance(pixels, str) else memoryview(pixels)
             if not self.topic.type.endswith("CompressedImage"):
                 return _raw_image(message, pixels, where)
-            return _packed_image(str(message.format).lower(), pixels, where)
+            return _packed_image(str(message.format).lower(), bytes(pixels), where)
 
     def command(self, data: bytes) -> tuple[int, float, float, float]:
         """Return stamp, [ns], speed, [cm/s], steering angle and yaw rate, [rad] and [rad/s], positive left.
@@ -162,7 +162,7 @@ def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, 
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR)) if "compressed rgb" in form else image
 
 
-def _raw_image(message: Any, pixels: bytes, where: object) -> UInt8[np.ndarray, "h w 3"]:
+def _raw_image(message: Any, pixels: bytes | memoryview, where: object) -> UInt8[np.ndarray, "h w 3"]:
     height, width, step = int(message.height), int(message.width), int(message.step)
     if message.encoding not in _ENCODINGS:
         raise DriveFormatError(
