@@ -13,7 +13,7 @@ from datagen.quality.figures import (
     map_evidence,
     map_figures,
     map_notes,
-    steering_correlation,
+    steering_answer,
 )
 from datagen.quality.measure import VERDICT_REACH_CM, MapQuality, measure_map, quality_figures
 from datagen.quality.places import withheld_figures, withhold_wrong_places
@@ -77,7 +77,8 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     figures |= quality_figures(quality)
     figures["withheld"] = withheld_figures(drive_map, list(quality.wrong))
     figures["lane_width"] = asdict(assembled.lane)
-    figures["steering_correlation"] = steering_correlation(mapped)
+    steering = steering_answer(mapped)
+    figures["steering_correlation"] = None if steering is None else steering.correlation
     figures["pauses"] = prepared.pauses
     request = prepared.request
     figures["given"] = {

@@ -16,6 +16,8 @@ from datagen.prepare import MapRequest, PreparedDrive, prepare
 from datagen.quality.figures import Report, map_edges
 from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
+from datagen.quality.verdict import verdict_lines
+from datagen.quality.without_map import text_without_map
 from datagen.refusal import Attempt, report_refusal
 from datagen.segments import camera_of_drive, fit_lanes, solve_drive
 from datagen.settings import MapSettings
@@ -89,13 +91,14 @@ def map_key(request: MapRequest, settings: MapSettings) -> str:
 
 
 def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
-    """Write the report of a refusal, and say where it is: the end of a sentence."""
+    """Write the report of a refusal, and say where it is and what to do without: the end of a sentence."""
+    instead = f"; {text_without_map(attempt.request.drive_path, out, None)}"
     try:
-        return f"; see {report_refusal(attempt, error, out)}"
+        return f"; see {report_refusal(attempt, error, out)}{instead}"
     except DriveFormatError:  # there is nothing to show
         return ""
     except LanenetError as failed:  # what was refused is worse
-        return f"; its report could not be written ({failed})"
+        return f"; its report could not be written ({failed}){instead}"
 
 
 def _map_drive(
@@ -125,15 +128,16 @@ def _map_drive(
         "notes": notes,
     }
     with atomic_folder(out, "map", check_map_files) as folder:
-        write_checked(folder, prepared, assembled, checked, figures, camera.how, pictures)
+        write_checked(folder, out, prepared, assembled, checked, figures, camera.how, pictures)
         Output(folder / "map.yaml", key).mark()
     verdict = checked.verdict
     first = f"verdict: {verdict.grade}: {verdict.sentence}"
-    return Report((first, *verdict.reasons, *notes, *verdict.remarks), figures)
+    return Report((first, *verdict_lines(verdict.reasons, verdict.remarks), *notes), figures)
 
 
 def write_checked(
     folder: Path,
+    out: Path,
     prepared: PreparedDrive,
     assembled: AssembledMap,
     checked: CheckedMap,
@@ -145,6 +149,7 @@ def write_checked(
 
     Args:
         folder: The folder.
+        out: Where it will be.
         prepared: The drive.
         assembled: Its map.
         checked: The same with its verdict.
@@ -158,11 +163,12 @@ def write_checked(
     write_text(folder / SETTINGS_NAME, dump_settings(settings))
     write_tum(folder / "open_loop.tum", drive_map.t_s, assembled.open_poses)
     if pictures:
-        _draw(folder, assembled, checked, figures, settings)
+        _draw(folder, out, assembled, checked, figures, settings)
 
 
 def _draw(
     folder: Path,
+    out: Path,
     assembled: AssembledMap,
     checked: CheckedMap,
     figures: dict[str, Any],
@@ -175,5 +181,5 @@ def _draw(
     shown = np.linspace(0, len(drive_map.frames) - 1, _SHOWN).astype(int)
     draw_contact_sheet(folder / "frames.png", mapped, shown)
     png = (folder / "map.png").read_bytes()
-    page = report_page(mapped, checked.quality, checked.verdict, figures, opened, png, settings.verdict)
+    page = report_page(mapped, checked.quality, checked.verdict, figures, opened, png, settings.verdict, out)
     write_text(folder / PAGE_NAME, page)

@@ -12,6 +12,7 @@ import yaml
 from jaxtyping import Float, UInt8
 
 from datagen.prepare import MapRequest, PreparedDrive
+from datagen.quality.without_map import commands_without_map
 from datagen.segments import CameraOfDrive, SolvedDrive
 from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
@@ -28,6 +29,7 @@ from lanenet.page import (
     Picture,
     Row,
     bullets,
+    commands,
     details,
     gallery,
     note,
@@ -98,7 +100,7 @@ def report_refusal(attempt: Attempt, error: LanenetError, out: Path) -> Path:
     Raises:
         LanenetError: If it cannot be written, or the drive cannot be read.
     """
-    page = refusal_page(attempt, error)
+    page = refusal_page(attempt, error, out)
     if (out / "map.yaml").is_file():
         write_text(out / BESIDE_MAP_NAME, page)
         return out / BESIDE_MAP_NAME
@@ -109,7 +111,7 @@ def report_refusal(attempt: Attempt, error: LanenetError, out: Path) -> Path:
     return out / PAGE_NAME
 
 
-def refusal_page(attempt: Attempt, error: LanenetError) -> str:
+def refusal_page(attempt: Attempt, error: LanenetError, out: Path) -> str:
     """Return the page: why there is no map, what to do, what was tried, and what the frames show."""
     drive = attempt.drive
     cause, what_to_do = _cause_and_remedy(error, drive)
@@ -118,6 +120,8 @@ def refusal_page(attempt: Attempt, error: LanenetError) -> str:
     segments = () if attempt.solved is None else attempt.solved.segments
     body = [
         remedy(what_to_do),
+        section("Lines all the same"),
+        commands(commands_without_map(attempt.request.drive_path, out, None)),
         section("What the camera saw"),
         note(
             "Frames from all over the drive. Are both lines of the lane in view, sharp, and brighter or "

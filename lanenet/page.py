@@ -71,6 +71,7 @@ details{border-top:1px solid var(--edge);padding:.2rem 0}
 details:last-of-type{border-bottom:1px solid var(--edge)}
 summary{font-weight:600;cursor:pointer;padding:.5rem 0}
 code{white-space:nowrap;font-size:.92em}
+pre{white-space:pre-wrap;background:var(--card);padding:.6rem 1rem;border-radius:.3rem;font-size:.85rem}
 ul{padding-left:1.2rem}li{margin:.3rem 0}
 .key i{display:inline-block;width:.9em;height:.9em;border-radius:.2em;border:1px solid var(--soft);
 vertical-align:-.1em;margin-right:.4em}
@@ -152,6 +153,14 @@ def bullets(lines: Sequence[str]) -> str:
     """List sentences; nothing if there is none."""
     shown = "".join(f"<li>{_shown(as_sentence(line))}</li>" for line in lines)
     return f"<ul>{shown}</ul>" if lines else ""
+
+
+def commands(lines: Sequence[tuple[str, str]]) -> str:
+    """Show command lines to be copied, each below what it does."""
+    return "\n".join(
+        f"<p>{html.escape(as_sentence(what)[:-1])}:</p><pre>{html.escape(command)}</pre>"
+        for what, command in lines
+    )
 
 
 def colour_key(entries: Sequence[tuple[tuple[int, int, int], str]]) -> str:

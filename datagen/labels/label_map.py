@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from datagen.quality.figures import Report
 from datagen.quality.pictures import draw_contact_sheet
+from datagen.quality.without_map import text_without_map
 from datagen.slam.odometry.scans import Progress
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
@@ -253,9 +254,10 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
     except MapFormatError:  # the verdict stands without its reasons
         reason = "its report cannot be read"
     page = map_folder / PAGE_NAME
+    instead = text_without_map(Path(drive_map.meta.drive), map_folder, drive_map.meta.lane_width_cm)
     # A map without pictures has no page.
     details = page if page.is_file() else map_folder / "report.json"
     raise TrackingLostError(
         f"{map_folder}: the map was rejected: {reason}; see {details}; lanenet label --force labels it all "
-        "the same"
+        f"the same; {instead}"
     )

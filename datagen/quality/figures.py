@@ -120,12 +120,26 @@ def free_lane_cm(parts: list[MappedSegment]) -> float | None:
     return float(np.median(free)) if free else None
 
 
-def steering_correlation(mapped: MappedDrive) -> float | None:
-    """Correlation of the path's curvature with the steering command, at the delay where it is strongest.
+@dataclass(frozen=True)
+class SteeringAnswer:
+    """How the curvature of a map's path answers to the steering command.
+
+    Attributes:
+        correlation: At that delay; below 0 where the car turns right when it is steered left.
+        delay_frames: Delay at which the correlation is strongest.
+    """
+
+    correlation: float
+    delay_frames: int
+
+
+def steering_answer(mapped: MappedDrive) -> SteeringAnswer | None:
+    """Correlate the path's curvature with the steering command, at the delay where that is strongest.
+
+    Every statement of a report on the steering rests on this one.
 
     Returns:
-        Below 0 where the car turns right when it is steered left. None if nothing was commanded, or if the
-        command does not explain the path.
+        None if nothing was commanded, or if the command does not explain the path.
     """
     drive_map = mapped.drive_map
     turn = commands_of(mapped.drive, drive_map.camera.wheelbase_cm).turn
@@ -135,14 +149,14 @@ def steering_correlation(mapped: MappedDrive) -> float | None:
     step = np.hypot(delta[:, 0], delta[:, 1])
     driven = (step > 0.3 * np.median(step)) & ~mapped.starts[1:]
     curvature = delta[driven, 2] / step[driven]
-    found = [0.0]
+    found = [SteeringAnswer(0.0, 0)]
     for lag in _LAGS:
         command = delayed(turn, lag)[mapped.rows][1:][driven]
         if len(command) > 2 and min(np.std(command), np.std(curvature)) > 1e-9:
-            found.append(float(np.corrcoef(command, curvature)[0, 1]))
-    strongest = max(found, key=abs)
+            found.append(SteeringAnswer(float(np.corrcoef(command, curvature)[0, 1]), lag))
+    strongest = max(found, key=lambda one: abs(one.correlation))
     least = max(_LEAST_CORRELATION, _CHANCE_SIGMAS / np.sqrt(max(len(curvature), 1)))
-    return strongest if abs(strongest) >= least else None
+    return strongest if abs(strongest.correlation) >= least else None
 
 
 def contradicted_share(

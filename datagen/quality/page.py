@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
+from datagen.quality.figures import steering_answer
 from datagen.quality.measure import MapQuality
 from datagen.quality.pictures import held_out_pictures, withheld_pictures
 from datagen.quality.plots import frames_plot, residual_plot, speed_plot, steering_plot, trajectory_plot
@@ -22,8 +24,8 @@ from datagen.quality.rows import (
     share_rows,
     summary_rows,
 )
-from datagen.quality.verdict import Verdict, VerdictSettings
-from datagen.slam.commands import SteeringFit
+from datagen.quality.verdict import MOST_LINES, Verdict, VerdictSettings, verdict_lines
+from datagen.quality.without_map import commands_without_map
 from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import MappedDrive
@@ -31,6 +33,7 @@ from lanenet.page import (
     Picture,
     Row,
     bullets,
+    commands,
     details,
     gallery,
     note,
@@ -58,6 +61,7 @@ def report_page(
     opened_poses: Float[np.ndarray, "n 3"],
     map_png: bytes,
     settings: VerdictSettings,
+    folder: Path,
 ) -> str:
     """Write the report of a map as HTML.
 
@@ -69,12 +73,18 @@ def report_page(
         opened_poses: Poses before the loops were closed, in the map's scale.
         map_png: Picture of the map from above.
         settings: Bounds of the verdict, drawn in the residual plot.
+        folder: Where the map will be.
     """
     drive, drive_map = mapped.drive, mapped.drive_map
     held, pictures = figures["held_out"], held_out_pictures(mapped, quality)
     worst = pictures.pop("worst", [])
+    said = verdict_lines(verdict.reasons, verdict.remarks)
+    lane_cm, rejected = drive_map.meta.lane_width_cm, verdict.grade == "reject"
     body = [
-        bullets([*verdict.reasons, *verdict.remarks]),
+        bullets(said[:MOST_LINES]),
+        details(f"{len(said) - MOST_LINES} more", bullets(said[MOST_LINES:])),
+        section("Lines all the same") if rejected else "",
+        commands(commands_without_map(drive.path, folder, lane_cm)) if rejected else "",
         table(summary_rows(figures, drive_map)),
         section("Map"),
         photo(_shown_map(map_png, drive_map)),
@@ -88,6 +98,14 @@ def report_page(
         if worst
         else "",
         gallery(worst),
+        section("Strip of frames"),
+        plot(
+            "Along the drive, a mark for each frame. Above: how far each held-out frame lies from the map. "
+            "Below, the strip: green frames have labels, and each further row is a reason why others have "
+            "none.",
+            frames_plot,
+            *(quality, drive, drive_map),
+        ),
         section("More"),
         details("What was done", bullets(figures["notes"])),
         details(
@@ -95,16 +113,7 @@ def report_page(
             *(subsection(title.capitalize()) + gallery(shown) for title, shown in pictures.items()),
         ),
         details("Distance of the lines from the edges", *_residuals(quality, held, drive, settings)),
-        details(
-            "Labels",
-            table(share_rows(figures["labelled"])),
-            plot(
-                "Along the drive: above, how far each held-out frame lies from the map; below, which frames "
-                "have labels, and why others get none.",
-                frames_plot,
-                *(quality, drive, drive_map),
-            ),
-        ),
+        details("Labels", table(share_rows(figures["labelled"]))),
         details(
             "Path and loops",
             plot(
@@ -120,7 +129,7 @@ def report_page(
             table(camera_rows(drive_map.camera, figures.get("calibration"))),
             table(scale_rows(drive_map.meta), texts=2),
         ),
-        details("Steering and speed", *_commands(mapped, figures["segments_mapped"])),
+        details("Steering and speed", *_commands(mapped)),
     ]
     return page_of(f"Map of {drive.name}", verdict.grade, verdict.sentence, body)
 
@@ -161,16 +170,20 @@ def _residuals(
     ]
 
 
-def _commands(mapped: MappedDrive, segments: list[dict[str, Any]]) -> list[str]:
-    fits = [None if one["steering"] is None else SteeringFit(**one["steering"]) for one in segments]
-    steering = plot(
-        "Each dot is a frame: how the car was steered, and how the path bends there. On a line, the steering "
-        "explains the path.",
-        steering_plot,
-        *(mapped, fits),
-    )
+def _commands(mapped: MappedDrive) -> list[str]:
+    answer = steering_answer(mapped)
+    if answer is None:
+        steering = note("There is no steering command, or it does not explain the path.")
+    else:
+        reversed_too = " It falls: the car turns the other way." if answer.correlation < 0.0 else ""
+        steering = plot(
+            "Each dot is a frame: how the car was steered, and how the path bends there. Along the line, the "
+            f"steering explains the path.{reversed_too}",
+            steering_plot,
+            *(mapped, answer.delay_frames),
+        )
     return [
-        steering or note("There is no steering command, or it does not explain the path."),
+        steering,
         plot("Distance between neighbouring frames, and the command.", speed_plot, mapped),
     ]
 

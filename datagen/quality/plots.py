@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from datagen.quality.measure import LABELLED, VERDICT_REACH_CM, MapQuality
 from datagen.quality.residuals import join_samples, summarise
-from datagen.slam.commands import SteeringFit, commands_of, delayed
+from datagen.slam.commands import commands_of, delayed
 from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import DELETED, MappedDrive
@@ -104,30 +104,37 @@ def frames_plot(quality: MapQuality, drive: Drive, drive_map: DriveMap) -> bytes
     return png_bytes(figure)
 
 
-def steering_plot(mapped: MappedDrive, fits: list[SteeringFit | None]) -> bytes | None:
-    """Curvature of the driven path over the steering command, with a fitted line; None without a fit."""
+def steering_plot(mapped: MappedDrive, delay_frames: int) -> bytes | None:
+    """Curvature of the driven path over the steering command, with a line fitted to each segment.
+
+    Args:
+        mapped: The map with its drive.
+        delay_frames: Delay of the steering.
+
+    Returns:
+        None where nothing was commanded.
+    """
     drive, drive_map, rows = mapped.drive, mapped.drive_map, mapped.rows
     turn = commands_of(drive, drive_map.camera.wheelbase_cm).turn
-    if turn is None or not any(fits):
+    if turn is None:
         return None
     figure, (axes,) = _figure(3.2)
-    for segment, fit in enumerate(fits):
+    for segment in np.unique(drive_map.segment).tolist():
         part = np.flatnonzero(drive_map.segment == segment)
-        if fit is None or len(part) < 3:
+        if len(part) < 3:
             continue
         delta = np.diff(drive_map.poses[part], axis=0)
         step = np.hypot(delta[:, 0], delta[:, 1])
         moving = (step > 0.3 * np.median(step)) & ~mapped.starts[part[1:]]
-        command = delayed(turn[rows[part]], fit.lag_frames)[1:][moving]
+        command = delayed(turn, delay_frames)[rows[part]][1:][moving]
         curvature = 100.0 * delta[moving, 2] / step[moving]
         axes.plot(command, curvature, ".", ms=2, alpha=0.5, color=f"C{segment}")
         if np.std(command) < 1e-9 or np.std(curvature) < 1e-9:
             continue
-        # Fitted again: the filter's own fit preceded the adjustment of camera and poses.
         gain, trim = np.polyfit(command, curvature, 1)
         r = float(np.corrcoef(command, curvature)[0, 1])
         ends = np.array([command.min(), command.max()])
-        label = f"{gain:.2f} per unit, delay {fit.lag_frames} frames, r = {r:.2f}"
+        label = f"{gain:.2f} per unit, delay {delay_frames} frames, r = {r:.2f}"
         axes.plot(ends, gain * ends + trim, "k-", lw=1.0, label=label)
     axes.set(xlabel="steering command, positive left", ylabel="curvature, 1/m")
     if axes.get_legend_handles_labels()[0]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 from pydantic import Field
 
 from lanenet.config import Settings
 from lanenet.errors import counted
+
+#: Lines of a verdict that people are shown at once. Chosen: what is read of a list.
+MOST_LINES = 3
 
 
 @dataclass(frozen=True)
@@ -233,6 +237,17 @@ _RECORD_WHOLE = (
 _USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
 #: Share of frames that is worth naming.
 _TOLD = 0.02
+
+
+def verdict_lines(reasons: Sequence[str], remarks: Sequence[str]) -> tuple[str, ...]:
+    """Order what a verdict says: the two worst findings and the first remark, which are shown; the rest."""
+    return (*reasons[:2], *remarks[:1], *reasons[2:], *remarks[1:])
+
+
+def folded(lines: Sequence[str], page: Path) -> list[str]:
+    """Return a verdict and its first lines, and where the others are."""
+    shown, more = list(lines[: 1 + MOST_LINES]), len(lines) - 1 - MOST_LINES
+    return [*shown, f"and {more} more in {page}"] if more > 0 else shown
 
 
 def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:

@@ -251,7 +251,7 @@ def _write(
             own = folder / name
             own.mkdir()
             how = "adjusted together with those of other drives of the track" if shared else "as it was"
-            write_checked(own, prepared, assembled, checked, report, how, pictures=True)
+            write_checked(own, out / name, prepared, assembled, checked, report, how, pictures=True)
             check_map_files(own)
             verdicts[name] = checked.verdict
             members.append((name, assembled, checked.mapped.drive_map))

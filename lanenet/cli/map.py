@@ -52,6 +52,8 @@ def map_drive(
     """Find the poses of a drive and a map of its lane lines; without a camera, find that too."""
     from datagen.pipeline import MapRequest, MapSettings
     from datagen.pipeline import map_drive as run
+    from datagen.quality.verdict import folded
+    from datagen.quality.without_map import text_without_map
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     views.check(drive)
@@ -63,12 +65,16 @@ def map_drive(
     )
     with console.progress_bar("map") as progress:
         report = run(request, settings, out, progress)
-    console.show_lines(report.lines)
+    page = out / "report.html"
+    console.show_lines(folded(report.lines, page))
     if views:
         view_map(views, out)
-    console.wrote(out, out / "report.html", *views.files)
+    console.wrote(out, page, *views.files)
     if report.figures["verdict"]["grade"] == "reject":
-        raise LanenetError(f"{out}: the map was rejected: it is kept for inspection, but gives no labels")
+        raise LanenetError(
+            f"{out}: the map was rejected: it is kept for inspection, but gives no labels; "
+            f"{text_without_map(drive, out, lane_width)}"
+        )
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
 
 

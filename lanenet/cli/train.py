@@ -297,6 +297,7 @@ class _Run:
             TrackingLostError: If the map was rejected; names the cause, the remedy and the report.
         """
         from datagen.labels.label_map import refuse_rejected
+        from datagen.quality.verdict import folded, verdict_lines
         from lanenet.data.label_set import read_label_index
         from lanenet.data.maps.folder import read_map, verdict_of
 
@@ -322,7 +323,9 @@ class _Run:
         verdict = verdict_of(job.frames)
         # Of a map that is not good, the sentence counts what it leaves to the lines below it.
         reasons = () if verdict.grade == "good" else verdict.reasons
-        console.show_lines([f"verdict: {verdict.grade}: {verdict.sentence}", *reasons, *verdict.remarks])
+        first = f"verdict: {verdict.grade}: {verdict.sentence}"
+        lines = (first, *verdict_lines(reasons, verdict.remarks))
+        console.show_lines(folded(lines, job.frames / "report.html"))
         console.show_lines([f"report: {job.frames / 'report.html'}"])
 
     def _label(self) -> PreparedData:

@@ -10,6 +10,7 @@ from lanenet.page import (
     as_sentence,
     bullets,
     colour_key,
+    commands,
     details,
     gallery,
     page_of,
@@ -62,6 +63,15 @@ def test_options_are_not_broken_at_their_hyphens():
         "give (--camera), or --camera-height"
     )
     assert "<code>" not in remedy("a - b, well--known")
+
+
+def test_command_lines_stand_apart_as_they_are_typed():
+    text = commands([("lines without a camera", "lanenet detect 'my <tub>' --out a.csv")])
+    expected = (
+        "<p>Lines without a camera:</p><pre>lanenet detect &#x27;my &lt;tub&gt;&#x27; --out a.csv</pre>"
+    )
+    assert text == expected
+    assert not commands([])
 
 
 def test_text_columns_break_and_figures_do_not():

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
 from lanenet.config import Settings, check_settings, read_yaml
-from lanenet.data.camera_file import read_camera, write_camera
+from lanenet.data.camera_file import MAP_CAMERA_NAME, read_own_camera, write_camera
 from lanenet.data.drives.recording import MAX_TIME_S
 from lanenet.data.files import require, write_json, write_text
 from lanenet.data.maps.frame_lines import FrameLanes, assign_lanes
@@ -257,7 +257,7 @@ def read_map(folder: Path) -> DriveMap:
     lines = inside.file("lanes.json", folder, MapFormatError)
     return DriveMap(
         meta=meta,
-        camera=read_camera(inside.file("camera.yaml", folder, MapFormatError)),
+        camera=read_own_camera(inside.file(MAP_CAMERA_NAME, folder, MapFormatError)),
         frames=table["frame"],
         t_s=table["t_s"],
         poses=np.stack([table[name] for name in _POSE], axis=1),

@@ -293,6 +293,22 @@ def test_a_rejected_map_is_written_and_an_error(asked: Asked) -> None:
     assert "the map was rejected" in error_of(result)
     assert "verdict: reject" in result.stdout and "wrote m/report.html" in result.stdout
     assert "next:" not in result.stdout
+    # What finds lines all the same, to be copied: one needs no camera, the other takes that of this map.
+    error = error_of(result)
+    assert "lanenet detect tub --detector hough --out m-hough.csv --video m-hough.mp4" in error
+    assert (
+        "lanenet detect tub --model checkpoints/general --camera m --lane-width 40 --out m-network" in error
+    )
+    assert "doubtful as the map" in error
+
+
+def test_map_shows_three_lines_below_the_verdict_and_says_where_the_others_are(asked: Asked) -> None:
+    lines = ("verdict: usable", *(f"line {k}" for k in range(11)))
+    map_drive = asked.function("map", Report(lines, "usable"))
+    asked.module("datagen.pipeline", MapRequest=MapRequest, MapSettings=FakeSettings, map_drive=map_drive)
+    result = run("map", "tub", "--lane-width", "40", "--out", "m")
+    assert "line 2" in result.stdout and "line 3" not in result.stdout
+    assert "and 8 more in m/report.html" in result.stdout
 
 
 def test_map_that_is_lost_says_so(asked: Asked) -> None:

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
+from datagen.quality import page as page_module
 from datagen.quality import plots
-from datagen.quality.figures import steering_correlation
+from datagen.quality.figures import steering_answer
 from datagen.quality.pictures import draw_map
 from datagen.slam.camera.coarse import guessed_camera
-from datagen.slam.commands import SteeringFit
 from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
@@ -129,13 +129,13 @@ def test_steps_and_curvature_across_a_break_are_left_out(mapped, drawn):
     step = np.asarray(drawn[0].axes[0].lines[0].get_ydata(), dtype=float)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(step)) + 1, STARTS[1:])
     np.testing.assert_allclose(step[np.isfinite(step)], 2.0)
-    plots.steering_plot(mapped, [SteeringFit(1.0, 0.0, 0, 0.9), None])
+    plots.steering_plot(mapped, 0)
     # Of the first segment's 25 frames, two begin a run.
     assert len(drawn[1].axes[0].lines[0].get_ydata()) == 23
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0, None])
-def test_steering_that_turns_the_car_the_other_way_is_noticed(mapped, sign):
+def test_steering_that_turns_the_car_the_other_way_is_noticed(mapped, drawn, sign):
     """The car turns as it is steered, the other way round, or for reasons of its own; two frames later."""
     n = len(ROWS)
     steered = mapped.drive.commands.angle[np.maximum(ROWS - 2, 0)]
@@ -145,7 +145,16 @@ def test_steering_that_turns_the_car_the_other_way_is_noticed(mapped, sign):
     poses = np.cumsum(2.0 * np.column_stack([np.cos(heading), np.sin(heading), 0.0 * heading]), axis=0)
     poses[:, 2] = heading
     turned = replace(mapped, drive_map=replace(mapped.drive_map, poses=poses))
-    found = steering_correlation(turned)
-    assert found is None if sign is None else abs(found - sign) < 0.05
+    found = steering_answer(turned)
+    text = page_module._commands(turned)[0]
+    if sign is None:
+        assert found is None
+        assert "does not explain the path" in text
+    else:
+        assert abs(found.correlation - sign) < 0.05
+        assert found.delay_frames == 2
+        # What the section says is what the verdict says.
+        assert "does not explain the path" not in text
+        assert ("turns the other way" in text) == (sign < 0.0)
     blind = replace(mapped, drive=replace(mapped.drive, commands=Commands()))
-    assert steering_correlation(blind) is None
+    assert steering_answer(blind) is None

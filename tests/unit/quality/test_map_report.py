@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import os
@@ -20,6 +21,7 @@ import yaml
 
 from datagen.labels.label_map import label_map, refuse_rejected
 from datagen.pipeline import MapRequest, map_drive
+from datagen.quality.verdict import VerdictSettings
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
@@ -138,6 +140,30 @@ def test_held_out_frames_have_no_say_in_the_lines(drive, mapped, tmp_path):
     off = np.abs(first.lines[0][0].points(s) - second.lines[0][0].points(s))
     assert 0.0 < np.nanmax(off) < 1.0
     assert first.meta.verdict == "usable" and not first.held_out.any()
+
+
+def test_a_rejected_map_shows_three_findings_and_what_works_without_it(drive, tmp_path):
+    """The rest is folded; a remedy that sends to the strip of frames finds a heading of that name."""
+    strict = VerdictSettings(max_sd_px=1e-6, max_p95_px=1e-6, min_labelled=0.9999, height_cm=(1.0, 2.0))
+    out = tmp_path / "maps" / "one"
+    report = map_drive(MapRequest(drive, 40.0), SETTINGS.model_copy(update={"verdict": strict}), out)
+    verdict = report.figures["verdict"]
+    assert verdict["grade"] == "reject"
+    page = html.unescape((out / "report.html").read_text(encoding="utf-8"))
+    first, *_ = re.findall(r"<ul>(.*?)</ul>", page, re.DOTALL)
+    assert first.count("<li>") == 3
+    folded = re.search(r"<details><summary>(\d+) more</summary><ul>(.*?)</ul></details>", page, re.DOTALL)
+    assert folded is not None
+    assert int(folded[1]) == folded[2].count("<li>") == len(verdict["reasons"]) + len(verdict["remarks"]) - 3
+    assert "<h2>Strip of frames</h2>" in page
+    text = re.sub("<[^>]+>", "", page)
+    for words in (
+        f"lanenet detect {drive} --detector hough --out {out}-hough.csv --video {out}-hough.mp4",
+        f"lanenet detect {drive} --model checkpoints/general --camera {out} --lane-width 40 --out {out}-net",
+    ):
+        assert words in text
+        with pytest.raises(TrackingLostError, match=re.escape(words)):
+            label_map(out, tmp_path / "l.parquet")
 
 
 def test_a_rejected_map_is_not_labelled_unless_forced(mapped, tmp_path):
