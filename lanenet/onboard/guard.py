@@ -220,8 +220,8 @@ class GuardedActuator:
             # The guard cannot go to neutral any more, and the motor runs on.
             self._kill()
             raise HardwareError(
-                f"the actuator has taken no command for {_STUCK_S:g} s: its driver hangs, and its guard was "
-                "killed"
+                f"the guard of the actuator has not answered for {_STUCK_S:g} s (a driver that hangs, or a "
+                "busy computer) and was killed"
             )
 
     def _kill(self) -> None:

@@ -239,7 +239,9 @@ class PatientLog(logging.Handler):
     def __init__(self) -> None:
         """Start the thread."""
         super().__init__()
-        self.setFormatter(logging.Formatter("lanenet guard: %(message)s"))
+        # On a terminal the drive's live line may stand where it writes.
+        clear = "\r\033[K" if os.isatty(2) else ""
+        self.setFormatter(logging.Formatter(f"{clear}lanenet guard: %(message)s"))
         self._lines: deque[bytes] = deque(maxlen=_LOG_LINES)
         self._waiting, self._written = threading.Event(), threading.Event()
         threading.Thread(target=self._run, name="log", daemon=True).start()

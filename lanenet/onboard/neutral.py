@@ -107,7 +107,7 @@ def settle(
                 return answer if counts else Neutral(False, "its owner has not ended")
             if not told and passed_s >= SENT_S and answer is not None:
                 told = True
-                log.warning("%s; trying for %g s", answer.text, patience_s)
+                log.warning("%s; tried for %g s", answer.text if unreadable else answer.may_run, patience_s)
             if turn is not None:
                 if (agreed := turn()) and not counts:
                     # An attempt that had begun before may have been undone since.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import logging
 import os
 import signal
@@ -18,11 +17,11 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lanenet.errors import ConfigError, HardwareError, LanenetError, MotorMayRunError, printable
 from lanenet.onboard.car_file import with_full_paths
-from lanenet.onboard.i2c import GUARD_MODULE, describe_process, lock_owners, words_of
+from lanenet.onboard.i2c import GUARD_MODULE, I2CChip, describe_process, lock_owners, words_of
 from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
 from lanenet.reading import MEBIBYTE, read_text
 
@@ -60,7 +59,9 @@ def read_actuator(path: Path, overrides: Sequence[str] = ()) -> ActuatorSettings
     return check_actuator(data["actuator"], str(path))
 
 
-def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
+def stop_car(
+    path: Path, overrides: Sequence[str] = (), say: Callable[[str], None] = lambda _: None
+) -> list[str]:
     """Put a car into neutral, end the process that drives it, and the drives of its file that still start.
 
     These are ended even if the file cannot be used or the actuator does not answer. If the file cannot be
@@ -69,6 +70,7 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
     Args:
         path: The car's file.
         overrides: ``key=value`` after it, as for ``drive``.
+        say: Gets each sentence of the answer as soon as it is known: neutral before drives have ended.
 
     Returns:
         What was done, a sentence each.
@@ -80,8 +82,7 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
         MissingExtraError: If its driver is not installed.
     """
     told = _tell_drives(path)
-    if not any(override.startswith("actuator") for override in overrides):
-        _tell_guards(path)
+    owner = "" if any(override.startswith("actuator") for override in overrides) else _tell_owner(path)
     try:
         with undisturbed():
             done = _stop_actuator(path, overrides)
@@ -94,12 +95,19 @@ def stop_car(path: Path, overrides: Sequence[str] = ()) -> list[str]:
             done += _end_guards(error)
         if not done:
             # A name that was mistyped in a hurry.
-            done = [f"{describe_process(pid)} drives" for pid in _drives()]
+            done = [f"NOT STOPPED: {describe_process(pid)} drives" for pid in _drives()]
         if not done:
-            raise
+            done = ["no drive of lanenet was found"]
         raise type(error)("; ".join([str(error), *done])) from None
+    say(done[0])
+    if owner and not any(owner in line for line in done):
+        done.append(f"ended {owner}")
     done += _end_drives(path, told)
-    return done if len(done) > 1 else [*done, "nothing of lanenet was driving"]
+    if len(done) == 1:
+        done.append("nothing of lanenet was driving")
+    for line in done[1:]:
+        say(line)
+    return done
 
 
 def hurry() -> None:
@@ -123,30 +131,32 @@ def _tell_drives(path: Path) -> dict[int, str]:
     return drives
 
 
-def _tell_guards(path: Path) -> None:
-    """Ask the guards of the device to end: they are in neutral long before the settings are checked."""
+def _tell_owner(path: Path) -> str:
+    """Ask the owner of the file's device to end: it is in neutral before the settings are checked.
+
+    Returns:
+        What it is; empty if there is none, or it is not known yet.
+    """
     import yaml
 
     # What is wrong with the file, or cannot be ended, is said later.
     with contextlib.suppress(Exception):
-        data = yaml.safe_load(read_text(path, ConfigError, MEBIBYTE))
-        ours = _device_of(with_full_paths(data, path)["actuator"])
-        for pid, words in _guards():
-            with contextlib.suppress(Exception):
-                if _device_of(json.loads(words[words.index(GUARD_MODULE) + 3])) == ours:
-                    _tell(pid, signal.SIGTERM)
-
-
-def _device_of(actuator: dict[str, Any]) -> tuple[Any, ...]:
-    """Return what tells one car's actuator from another's, without checks."""
-    defaults = {"kind": "", "bus": 1, "address": 0x40, "port": "/dev/ttyACM0", "myconfig": None}
-    return tuple(actuator.get(key, default) for key, default in defaults.items())
-
-
-def _guards() -> list[tuple[int, list[str]]]:
-    """Return the guards that run, with the words of their command lines."""
-    pids = [int(folder.name) for folder in Path("/proc").glob("[0-9]*")]
-    return [(pid, words) for pid in pids if GUARD_MODULE in (words := words_of(pid))]
+        data = yaml.safe_load(read_text(path, ConfigError, MEBIBYTE))["actuator"]
+        if data["kind"] == "serial":
+            pid = next(iter(lock_owners(Path(data["port"]).stat())), 0)
+        else:
+            # A Donkeycar's myconfig.py may name another chip.
+            chip = I2CChip(
+                data["bus"] if "myconfig" in data else data.get("bus", 1), data.get("address", 0x40)
+            )
+            chip.open()
+            pid = chip.owner()
+            chip.close()
+        text = describe_process(pid)
+        if pid > 0 and pid != os.getpid():
+            _tell(pid, signal.SIGTERM)
+            return text
+    return ""
 
 
 def _children(pid: int) -> list[int]:
@@ -412,10 +422,9 @@ def main(words: Sequence[str]) -> int:
     """Run ``lanenet stop`` without the command line's other verbs; returns the exit code."""
     hurry()
     try:
-        lines = stop_car(Path(words[0]), words[1:])
+        stop_car(Path(words[0]), words[1:], lambda line: _print(1, [line]))
     except LanenetError as error:
         return fail(error)
-    _print(1, lines)
     return 0
 
 

@@ -30,7 +30,7 @@ FAULTS: dict[str, tuple[int | None, str]] = {
     "control answers NaN": (BY_FAULT, "no lane in frame"),
     "process crashes": (-signal.SIGABRT, "the drive loop is gone"),
     "actuator raises": (1, "Remote I/O error"),
-    "actuator hangs": (1, "its driver hangs, and its guard was killed"),
+    "actuator hangs": (1, "has not answered for 0.25 s"),
     "guard killed": (1, "died"),
     "guard ended": (0, "neutral: stopped from outside"),
     "SIGKILL": (-signal.SIGKILL, "the drive loop is gone"),

@@ -50,7 +50,6 @@ STAGES = (
     "fit_lanes",
     "assemble",
     "check_map",
-    "map_edges",
 )
 
 

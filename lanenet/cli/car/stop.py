@@ -22,4 +22,4 @@ def stop(
     from lanenet.onboard.stop import hurry, stop_car
 
     hurry()
-    console.show_lines(stop_car(config, overrides or ()))
+    stop_car(config, overrides or (), console.say)

@@ -15,6 +15,10 @@ from lanenet.data.camera_file import read_camera
 from lanenet.errors import LanenetError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.onboard.actuators import make_actuator
+from lanenet.onboard.actuators.myconfig import with_myconfig
+from lanenet.onboard.actuators.pca9685 import PCA9685Settings
+from lanenet.onboard.actuators.pulses import PulseSettings, neutral_pulses
+from lanenet.onboard.actuators.recorder import RecorderSettings
 from lanenet.onboard.cameras import open_source
 from lanenet.onboard.devices import Frame, FrameSource, SourceEnded
 from lanenet.onboard.doctor.installation import Check, State, check_camera_file
@@ -242,7 +246,19 @@ def _actuator(settings: DriveSettings) -> Check:
         actuator.close()
     if left is None or left.confirmed is False:
         return Check(name, "problem", "no answer" if left is None else left.may_run)
-    return Check(name, "ok", f"answers: {left.text}")
+    pulses = "" if isinstance(settings.actuator, RecorderSettings) else f": {_neutral_of(settings.actuator)}"
+    return Check(name, "ok", f"answers: {left.text}{pulses}")
+
+
+def _neutral_of(actuator: PulseSettings) -> str:
+    """Say which pulses neutral is made of; whether the speed controller knows them, nobody has checked."""
+    if isinstance(actuator, PCA9685Settings):
+        actuator = with_myconfig(actuator)
+        channels = f"channel {actuator.throttle_channel}", f"channel {actuator.steering_channel}"
+    else:
+        channels = "the motor's output", "the steering's"
+    pulses = neutral_pulses(actuator)
+    return f"{pulses.throttle_us:g} us on {channels[0]}, {pulses.steering_us:g} us on {channels[1]}"
 
 
 def _vcgencmd() -> str:
