@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,12 +12,12 @@ from jaxtyping import Float, Int
 from datagen.lanes.find import MappedSegment
 from datagen.lanes.scale import LaneWidth, ahead_sigma, fitted_width
 from datagen.prepare import PreparedDrive
+from datagen.quality.figures import free_lane_cm, map_edges, scaled_figures, segment_figures
 from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.odometry.scans import distances_seen
-from datagen.slam.segment import SolvedSegment
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.frames import map_from_car
+from lanenet.geometry.frames import car_from_map
 
 #: Edge points up to this distance are drawn, in camera heights. Chosen: further ones scatter.
 _DRAWN_HEIGHTS = 3.0
@@ -24,44 +25,75 @@ _DRAWN_HEIGHTS = 3.0
 
 @dataclass(frozen=True)
 class AssembledMap:
-    """A map, and the segments that it was assembled from.
+    """A map, with what is written beside it, in centimetres.
 
     Attributes:
-        drive_map: The map, [cm].
-        segments: Its segments, in the scale of the camera that they were solved with.
+        drive_map: The map.
         rows: Its frames, as positions in the drive.
-        factor: Turns the segments' lengths into centimetres.
-        lane: Width of the driven lane, [cm].
+        lane: Width of the driven lane.
+        edges: Columns of all edge points, see :func:`datagen.quality.figures.map_edges`.
+        open_poses: Poses before loops were closed.
+        segments: Figures of each segment, see :func:`datagen.quality.figures.segment_figures`.
+        free_lane_cm: See :func:`datagen.quality.figures.free_lane_cm`.
+        factor: What turned the lengths of the camera that was solved with into centimetres.
     """
 
     drive_map: DriveMap
-    segments: list[MappedSegment]
     rows: Int[np.ndarray, "n"]
-    factor: float
     lane: LaneWidth
-
-    @property
-    def open_poses(self) -> Float[np.ndarray, "n 3"]:
-        """Poses before loops were closed, [cm]."""
-        return _in_order(self.segments, [s.solved.open_poses for s in self.segments]) * _pose_scale(
-            self.factor
-        )
+    edges: dict[str, np.ndarray]
+    open_poses: Float[np.ndarray, "n 3"]
+    segments: list[dict[str, Any]]
+    free_lane_cm: float | None = None
+    factor: float = 1.0
 
     @property
     def near_points(self) -> list[Float[np.ndarray, "_ 2"]]:
-        """Edge points of each frame that are near enough to be drawn, [cm], frame map."""
-        return [self.factor * points for s in self.segments for points in near_points(s.solved)]
+        """Edge points of each frame near enough to be drawn, frame map; those of the first segment first."""
+        m, camera = self.drive_map, self.drive_map.camera
+        in_order = np.argsort(m.segment, kind="stable")
+        counts = np.bincount(np.searchsorted(m.frames, self.edges["frame"]), minlength=len(m.frames))[
+            in_order
+        ]
+        points = np.column_stack([self.edges["x_cm"], self.edges["y_cm"]]).astype(np.float64)
+        near, reach_cm = [], _DRAWN_HEIGHTS * camera.mounting.height_cm
+        for k, seen in zip(in_order, np.split(points, np.cumsum(counts)[:-1]), strict=True):
+            seen_car = car_from_map(seen, m.poses[k], camera.wheelbase_cm)
+            near.append(seen[distances_seen(seen_car, camera.mounting.lead_cm) < reach_cm])
+        return near
 
+    def scaled(self, factor: float, sigma: dict[str, float]) -> AssembledMap:
+        """Return the map with every length multiplied by a factor, as if the lane were so much wider.
 
-def near_points(solved: SolvedSegment) -> list[Float[np.ndarray, "_ 2"]]:
-    """Edge points of each frame that are near enough to be drawn, in the scale of the segment's camera."""
-    mounting = solved.camera.mounting
-    points, reach_cm = [], _DRAWN_HEIGHTS * mounting.height_cm
-    for k in range(len(solved.poses)):
-        seen = solved.scans.points_cm[solved.scans.frame(k)]
-        seen = seen[distances_seen(seen, mounting.lead_cm) < reach_cm]
-        points.append(map_from_car(seen, solved.poses[k], solved.camera.wheelbase_cm))
-    return points
+        The wheelbase is the car's own and stays; the distance of the camera from the rear axle is scaled.
+
+        Args:
+            factor: Of all lengths.
+            sigma: Standard deviation of each number of the camera.
+        """
+        m = self.drive_map
+        camera = with_known_scale(m.camera, factor, m.camera.wheelbase_cm)
+        lengths = {
+            name: factor * getattr(m.meta, name) for name in ("lane_width_cm", "mapped_lane_cm", "tape_cm")
+        }
+        scaled = replace(
+            m,
+            meta=m.meta.model_copy(update={**lengths, "ahead_sigma_cm": ahead_sigma(camera, sigma)}),
+            camera=camera,
+            poses=m.poses * _pose_scale(factor),
+            s_cm=m.s_cm * factor,
+            lines={number: [line.scaled(factor) for line in lines] for number, lines in m.lines.items()},
+        )
+        return replace(
+            self,
+            drive_map=scaled,
+            lane=self.lane.scaled(factor),
+            edges=self.edges | {name: np.float32(factor) * self.edges[name] for name in ("x_cm", "y_cm")},
+            open_poses=self.open_poses * _pose_scale(factor),
+            segments=scaled_figures(self.segments, factor),
+            free_lane_cm=None if self.free_lane_cm is None else factor * self.free_lane_cm,
+            factor=factor * self.factor,
+        )
 
 
 def assemble(
@@ -119,7 +151,16 @@ def assemble(
         contradicted=np.zeros((len(rows), 2), dtype=bool),
         marks=tuple(prepared.marks[row] for row in rows.tolist()) if prepared.marks else None,
     )
-    return AssembledMap(drive_map, segments, rows, factor, lane.scaled(factor))
+    return AssembledMap(
+        drive_map,
+        rows,
+        lane.scaled(factor),
+        map_edges(segments, drive.frames, factor),
+        _in_order(segments, [s.solved.open_poses for s in segments]) * _pose_scale(factor),
+        segment_figures(segments, drive.frames, factor),
+        free_lane_cm(segments),
+        factor,
+    )
 
 
 def _pose_scale(factor: float) -> Float[np.ndarray, "3"]:

@@ -9,7 +9,6 @@ from datagen.assemble import AssembledMap
 from datagen.lanes.trace import other_lane
 from datagen.prepare import PreparedDrive
 from datagen.quality.figures import (
-    free_lane_cm,
     map_evidence,
     map_figures,
     map_notes,
@@ -66,9 +65,8 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
         TrackingLostError: If held-out frames do not show the lines.
         CalibrationError: If they show one line only, but there is a lane of another width.
     """
-    drive, drive_map, segments = prepared.drive, assembled.drive_map, assembled.segments
-    free_cm = free_lane_cm(segments)
-    figures = map_figures(drive_map, segments, drive.frames, assembled.factor)
+    drive, drive_map, free_cm = prepared.drive, assembled.drive_map, assembled.free_lane_cm
+    figures = map_figures(drive_map, assembled.segments)
     notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
     mapped, quality = compare_with_frames(mapped)

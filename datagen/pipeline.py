@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +15,13 @@ from datagen.compile_ahead import compile_ahead
 from datagen.labels.label_map import label_map
 from datagen.made import Output, fingerprint, key_of
 from datagen.prepare import MapRequest, PreparedDrive, prepare
-from datagen.quality.figures import Report, map_edges
+from datagen.quality.figures import Report
 from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
 from datagen.quality.verdict import verdict_lines
 from datagen.quality.without_map import text_without_map
 from datagen.refusal import Attempt, report_refusal
+from datagen.rescale import Solved, rescaled
 from datagen.segments import camera_of_drive, fit_lanes, solve_drive
 from datagen.settings import MapSettings
 from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
@@ -26,7 +29,7 @@ from datagen.slam.segment import SegmentSolver, StageProgress
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
 from lanenet.data.files import atomic_folder, check_replaceable, write_text
-from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, write_map
+from lanenet.data.maps.folder import SETTINGS_NAME, check_map_files, kept_map, read_map_meta, write_map
 from lanenet.data.tables import write_tum
 from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError
 from lanenet.outputs import lock_output
@@ -43,8 +46,12 @@ def map_drive(
     out: Path,
     progress: StageProgress | None = None,
     pictures: bool = True,
+    earlier: Sequence[Path] = (),
 ) -> Report:
     """Map a drive: poses, edges, lane lines, pictures.
+
+    A finished map of the same drive with the same settings, but for the lane width, is only rescaled, see
+    :mod:`datagen.rescale`.
 
     Args:
         request: The drive and what is known about it.
@@ -53,6 +60,7 @@ def map_drive(
         progress: Called with (stage, done, total).
         pictures: Draw the map, its frames and the report's page; on a short drive a third of the time. A
             drive that is refused gets a page as well, see :mod:`datagen.refusal`.
+        earlier: Maps that may be such a map, beside the one in ``out``.
 
     Raises:
         TrackingLostError: If the drive is too short or shows no lane.
@@ -68,7 +76,8 @@ def map_drive(
             read_camera(request.camera_path)  # says nothing of the drive, so it has no report
         attempt = Attempt(request, settings)
         try:
-            return _map_drive(attempt, map_key(request, settings), out, progress, pictures)
+            like = next((one for one in (out, *earlier) if _differs_in_scale(one, request, settings)), None)
+            return _map_drive(attempt, map_key(request, settings), out, progress, pictures, like)
         except (CalibrationError, DriveFormatError) as error:
             page = _refused(attempt, error, out) if pictures else ""
             raise type(error)(f"{error}{kept_map(out)}{page}") from error
@@ -102,37 +111,73 @@ def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
 
 
 def _map_drive(
-    attempt: Attempt, key: str, out: Path, progress: StageProgress | None, pictures: bool
+    attempt: Attempt,
+    key: str,
+    out: Path,
+    progress: StageProgress | None,
+    pictures: bool,
+    like: Path | None,
 ) -> Report:
     request = attempt.request
     prepared = attempt.prepared = prepare(request, attempt.settings)
-    settings = prepared.settings
+    solver = SegmentSolver(prepared.settings, np.random.default_rng(prepared.settings.seed), progress)
+    found = None if like is None else rescaled(like, prepared)
+    if found is None:
+        found = _solve(attempt, prepared, solver)
+    assembled = found.assembled
+    solver.tell("lines and checks", 1, 2)
+    checked = check_map(prepared, assembled, found.figures)
+    solver.tell("lines and checks", 2, 2)
+    said = [found.said] if found.said else []
+    notes = [*said, *prepared.notes, *found.notes, *checked.notes]
+    figures = {
+        "drive": str(request.drive_path),
+        "frames": len(prepared.drive),
+        **found.figures,
+        **checked.figures,
+        "notes": notes,
+        "found_notes": list(found.notes),
+        "rescaled": found.said,
+    }
+    with atomic_folder(out, "map", check_map_files) as folder:
+        write_checked(folder, out, prepared, assembled, checked, figures, found.how_calibrated, pictures)
+        Output(folder / "map.yaml", key).mark()
+    verdict = checked.verdict
+    first = f"verdict: {verdict.grade}: {verdict.sentence}"
+    return Report(
+        (first, *said, *verdict_lines(verdict.reasons, verdict.remarks), *notes[len(said) :]), figures
+    )
+
+
+def _solve(attempt: Attempt, prepared: PreparedDrive, solver: SegmentSolver) -> Solved:
+    """Map a drive from its images."""
     compile_ahead()
-    solver = SegmentSolver(settings, np.random.default_rng(settings.seed), progress)
     camera = attempt.camera = camera_of_drive(prepared, solver)
     # Track, close loops, adjust: SegmentSolver.solve.
     solved = attempt.solved = solve_drive(prepared, camera, solver)
     solver.tell("lines and checks", 0, 2)
     lanes = fit_lanes(prepared, solved.segments, solved.refused, camera.doubt)
     assembled = assemble(prepared, camera.camera, camera.sigma, lanes.segments)
-    solver.tell("lines and checks", 1, 2)
-    checked = check_map(prepared, assembled, camera.figures)
-    solver.tell("lines and checks", 2, 2)
-    notes = [*prepared.notes, *camera.notes, *lanes.notes, *checked.notes]
-    figures = {
-        "drive": str(request.drive_path),
-        "frames": len(prepared.drive),
-        "segments": len(solved.segments),
-        **camera.figures,
-        **checked.figures,
-        "notes": notes,
-    }
-    with atomic_folder(out, "map", check_map_files) as folder:
-        write_checked(folder, out, prepared, assembled, checked, figures, camera.how, pictures)
-        Output(folder / "map.yaml", key).mark()
-    verdict = checked.verdict
-    first = f"verdict: {verdict.grade}: {verdict.sentence}"
-    return Report((first, *verdict_lines(verdict.reasons, verdict.remarks), *notes), figures)
+    figures = {"segments": len(solved.segments), **camera.figures}
+    return Solved(assembled, figures, camera.how, (*camera.notes, *lanes.notes))
+
+
+def _differs_in_scale(folder: Path, request: MapRequest, settings: MapSettings) -> bool:
+    """Tell whether a folder holds a finished map that differs from the wanted one in its lane width alone.
+
+    With the camera's height the lane width determines the focal length as well, and a known camera sets the
+    scale by itself: such maps are made anew.
+    """
+    try:
+        meta = read_map_meta(folder)
+    except LanenetError:  # none, or a damaged one
+        return False
+    if meta.scale_from == "camera" or request.camera_height_cm is not None:
+        return False
+    earlier = replace(request, lane_width_cm=meta.lane_width_cm)
+    if earlier == request or Path(meta.drive) != request.drive_path.resolve():
+        return False
+    return Output(folder / "map.yaml", map_key(earlier, settings)).done
 
 
 def write_checked(
@@ -158,8 +203,7 @@ def write_checked(
         pictures: Draw the map, its frames and the report's page.
     """
     drive_map, settings = checked.mapped.drive_map, prepared.settings
-    edges = map_edges(assembled.segments, prepared.drive.frames, assembled.factor)
-    write_map(folder, drive_map, edges, figures, how_calibrated)
+    write_map(folder, drive_map, assembled.edges, figures, how_calibrated)
     write_text(folder / SETTINGS_NAME, dump_settings(settings))
     write_tum(folder / "open_loop.tum", drive_map.t_s, assembled.open_poses)
     if pictures:

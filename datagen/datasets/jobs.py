@@ -6,6 +6,7 @@ see :mod:`datagen.made`.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,12 @@ class LeftOut:
     """Why a drive has no label set, for people."""
 
     reason: str
+
+
+def finished_maps(runs: Path) -> list[Path]:
+    """Return the maps that earlier commands and trainings finished in a folder of runs."""
+    markers = sorted([*runs.glob("*/map.done.json"), *runs.glob("*/drives/maps/*/map.done.json")])
+    return [marker.parent for marker in markers]
 
 
 @dataclass(frozen=True)
@@ -304,7 +311,11 @@ class RecordedJob:
         """
         settings = self.recording
         if not (self.is_map or self.is_labels):
-            self.map_output.make(lambda: map_drive(self._request, settings.map, self.frames, progress))
+            # One of another lane width is only rescaled.
+            earlier = finished_maps(self.folder.parent.parent)
+            self.map_output.make(
+                lambda: map_drive(self._request, settings.map, self.frames, progress, earlier=earlier)
+            )
             return
         if settings.frames is not None:
             raise ConfigError(f"data.drives: {self.frames} is finished: frames are chosen before mapping")
@@ -362,11 +373,15 @@ class RecordedJob:
         return parts
 
     def _check_width(self) -> None:
-        mapped_cm, given_cm = read_map(self.frames).meta.lane_width_cm, self.recording.lane_width_cm
+        meta, given_cm = read_map(self.frames).meta, self.recording.lane_width_cm
+        mapped_cm = meta.lane_width_cm
+        again = shlex.join(
+            ["lanenet", "map", meta.drive, "--lane-width", f"{given_cm:g}", "--out", str(self.frames)]
+        )
         if abs(mapped_cm - given_cm) > _SAME_WIDTH * given_cm:
             raise ConfigError(
                 f"data.drives: {self.frames} is a map of a lane of {mapped_cm:g} cm, but lane_width_cm is "
-                f"{given_cm:g}; map it anew or give the map's"
+                f"{given_cm:g}; give the map's, or rescale it in seconds: {again}"
             )
 
 

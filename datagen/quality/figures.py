@@ -67,11 +67,10 @@ def map_edges(
     }
 
 
-def map_figures(
-    drive_map: DriveMap, parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], factor: float
-) -> dict[str, Any]:
-    """Collect a map's figures; ``numbers`` and ``factor`` as for :func:`map_edges`."""
-    camera = drive_map.camera
+def segment_figures(
+    parts: list[MappedSegment], numbers: Int[np.ndarray, "f"], factor: float
+) -> list[dict[str, Any]]:
+    """Collect the figures of each segment; the arguments are those of :func:`map_edges`."""
     segments = []
     for part in parts:
         solved, lane = part.solved, part.lane
@@ -101,6 +100,36 @@ def map_figures(
                 "closed": part.lines[0].period_cm is not None,
             }
         )
+    return segments
+
+
+def scaled_figures(value: Any, factor: float, power: int = 0) -> Any:
+    """Multiply the lengths in figures by a factor: those under names in ``_cm``.
+
+    What stands under ``_per_m`` is divided by it. The steering's ``_per_cm`` stays: it is in the scale of the
+    camera that was solved with.
+
+    Args:
+        value: Figures, as a report has them.
+        factor: Of the lengths.
+        power: Of the factor, for numbers without a name of their own.
+    """
+    if isinstance(value, dict):
+        return {name: scaled_figures(one, factor, power or _power(name)) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [scaled_figures(one, factor, power) for one in value]
+    return value if value is None or not power else value * factor**power
+
+
+def _power(name: str) -> int:
+    if name.endswith("_per_m"):
+        return -1
+    return int(name.endswith("_cm") and not name.endswith("_per_cm"))
+
+
+def map_figures(drive_map: DriveMap, segments: list[dict[str, Any]]) -> dict[str, Any]:
+    """Collect a map's figures; ``segments`` are those of :func:`segment_figures`."""
+    camera = drive_map.camera
     m = camera.mounting
     return {
         "camera": {

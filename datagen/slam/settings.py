@@ -9,6 +9,7 @@ from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.loops.revisits import RevisitSettings
 from datagen.slam.odometry.image_pairs import OdometrySettings
 from lanenet.config import Settings
+from lanenet.geometry.camera import NOMINAL_WHEELBASE_CM
 from lanenet.perception.edges.road import PerceptionSettings
 
 
@@ -26,8 +27,7 @@ class GuessSettings(Settings):
         steep_roll_deg: Rolls to try then: a pan and tilt bracket, or one bent by hand, is seldom level.
         k1: First coefficient of the fisheye; the real drives have -0.03 to -0.07.
         lever_heights: Distance of the camera ahead of the rear axle; 0.9 on a Donkeycar.
-        wheelbase_cm: Distance between the axles, which sets where y = 0 lies under the car; 17 cm is a
-            Donkeycar's.
+        wheelbase_cm: Distance between the axles, which sets where y = 0 lies under the car.
         frames: Frames that the search looks at. Chosen: at 20 frames a second a bend and a straight section.
     """
 
@@ -38,7 +38,7 @@ class GuessSettings(Settings):
     steep_roll_deg: tuple[float, ...] = (-12.0, -6.0, 0.0, 6.0, 12.0)
     k1: float = -0.03
     lever_heights: float = Field(default=0.9, gt=0.0)
-    wheelbase_cm: float = Field(default=17.0, gt=0.0)
+    wheelbase_cm: float = Field(default=NOMINAL_WHEELBASE_CM, gt=0.0)
     frames: int = Field(default=250, ge=50)
 
 

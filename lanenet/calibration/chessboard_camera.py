@@ -34,7 +34,7 @@ from lanenet.calibration.views import (
     usable_views,
 )
 from lanenet.errors import CalibrationError
-from lanenet.geometry.camera import Camera, CameraModel, Mounting
+from lanenet.geometry.camera import NOMINAL_WHEELBASE_CM, Camera, CameraModel, Mounting
 
 ModelChoice = Literal["fisheye", "pinhole", "auto"]
 
@@ -90,7 +90,7 @@ def calibrate_lens(
     views: Sequence[BoardView],
     model: ModelChoice = "auto",
     mounting: Mounting | None = None,
-    wheelbase_cm: float = 26.0,
+    wheelbase_cm: float = NOMINAL_WHEELBASE_CM,
     progress: Callable[..., Any] | None = None,
 ) -> ChessboardCalibration:
     """Find the lens of a camera from views of a chessboard.

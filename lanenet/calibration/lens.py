@@ -12,13 +12,20 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from lanenet.geometry.camera import Camera, CameraModel, Mounting, fisheye_radius, fisheye_slope
+from lanenet.geometry.camera import (
+    NOMINAL_WHEELBASE_CM,
+    Camera,
+    CameraModel,
+    Mounting,
+    fisheye_radius,
+    fisheye_slope,
+)
 
 #: Numbers in D.
 N_DISTORTION: dict[CameraModel, int] = {"fisheye": 4, "pinhole": 5}
 N_INTRINSIC = 4
-#: Mounting and car of a lens that has none yet; those of a usual 1:10 car, as in the synthetic drives.
-NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM = 20.0, 26.0
+#: Mounting of a lens that has none yet; that of a usual 1:10 car, as in the synthetic drives.
+NOMINAL_HEIGHT_CM = 20.0
 #: Closer to the axis than this, the azimuth of a ray is rounding error.
 _NEAR_AXIS = 1e-9
 _NO_MOVE = np.zeros(3)

@@ -78,9 +78,9 @@ def chessboard(
     """Find a camera's lens from photos of a chessboard held in different tilts and places."""
     from lanenet.calibration.chessboard import common_turn, find_views, list_pictures, parse_board
     from lanenet.calibration.chessboard_camera import calibrate_lens
-    from lanenet.calibration.lens import NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM
+    from lanenet.calibration.lens import NOMINAL_HEIGHT_CM
     from lanenet.data.camera_file import write_camera, write_ros_camera_info
-    from lanenet.geometry.camera import Mounting
+    from lanenet.geometry.camera import NOMINAL_WHEELBASE_CM, Mounting
 
     for path in (out, ros):
         if path is not None:
@@ -293,9 +293,9 @@ def print_(
 
 
 def _read_lens(path: Path) -> Camera:
-    from lanenet.calibration.lens import NOMINAL_HEIGHT_CM, NOMINAL_WHEELBASE_CM
+    from lanenet.calibration.lens import NOMINAL_HEIGHT_CM
     from lanenet.data.camera_file import read_lens
-    from lanenet.geometry.camera import Mounting
+    from lanenet.geometry.camera import NOMINAL_WHEELBASE_CM, Mounting
 
     return read_lens(path, Mounting(NOMINAL_HEIGHT_CM), NOMINAL_WHEELBASE_CM)
 

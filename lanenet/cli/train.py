@@ -35,12 +35,13 @@ from lanenet.cli.shared.own_drive import (
     is_config,
     own_config,
     parts_of,
+    untrained_widths,
 )
 from lanenet.cli.shared.stages import Stages, stopped_in
 from lanenet.cli.shared.standing import next_on_car
 from lanenet.config import Settings, check_settings, dump_settings, load_settings, to_yaml
 from lanenet.data.files import write_text
-from lanenet.errors import CheckpointError, ConfigError, counted
+from lanenet.errors import CheckpointError, ConfigError, MapFormatError, counted
 from lanenet.outputs import make_folder
 from lanenet.reading import read_json
 
@@ -232,6 +233,7 @@ def train_run(
     stopped = stopped_in(log)
     with console.log_file(log):
         console.show_lines(tracks)
+        console.show_problems(untrained_widths(settings))
         if stopped is not None:
             console.say(
                 f"resumes: the last run of this name stopped in the stage {stopped}; what it finished with "
@@ -317,6 +319,8 @@ class _Run:
         finished = job.is_mapped
         with console.progress_bar("map") as progress:
             job.make_map(progress)
+        if not finished and (said := read_json(job.frames / "report.json", MapFormatError).get("rescaled")):
+            console.show_lines([said])
         if finished:
             console.show_lines([f"{job.frames}: a finished map, which is used"])
         refuse_rejected(job.frames, read_map(job.frames))

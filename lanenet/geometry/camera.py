@@ -19,6 +19,8 @@ from jaxtyping import Bool, Float
 
 CameraModel = Literal["fisheye", "pinhole"]
 
+#: Distance between the axles of a car of which nobody gave it: a Donkeycar's.
+NOMINAL_WHEELBASE_CM = 17.0
 _MAX_RESIDUAL_PX = 1e-6
 
 

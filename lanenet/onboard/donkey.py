@@ -40,14 +40,15 @@ import numpy as np
 from jaxtyping import Num, UInt8
 from pydantic import Field
 
-from lanenet.config import Rule, Settings, check_settings, load_settings
+from lanenet.config import Rule, Settings, check_settings, read_yaml
 from lanenet.control.controller import ControlSettings, LaneController, speed_of_cm_s, throttle_of
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives.sources import read_mask
 from lanenet.errors import ConfigError
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
-from lanenet.onboard.drive import DriveDetectorSettings
+from lanenet.onboard.car_file import with_full_paths
+from lanenet.onboard.drive import DriveDetectorSettings, with_wheelbase
 from lanenet.onboard.frame_check import RepeatCheck
 from lanenet.onboard.rules import PILOT_RULES
 from lanenet.onboard.safety import CommandLimiter, LimitSettings
@@ -151,13 +152,14 @@ class LanePilot:
 
     @staticmethod
     def from_file(path: str | Path) -> LanePilot:
-        """Build the pilot that a YAML file describes.
+        """Build the pilot that a YAML file describes; the wheelbase defaults to the camera file's.
 
         Raises:
             LanenetError: If the file or what it names cannot be used.
         """
         path = Path(path).expanduser()
-        return LanePilot(load_settings(DonkeySettings, path), path.parent)
+        data = with_wheelbase(with_full_paths(read_yaml(path), path))
+        return LanePilot(check_settings(DonkeySettings, data, str(path)), path.parent)
 
     def take_over(self) -> None:
         """Begin anew where a person drove: the throttle rises from 0, and no earlier lane is continued."""

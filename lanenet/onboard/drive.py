@@ -55,7 +55,7 @@ class DriveDetectorSettings(Settings):
         config: Settings file of the other detectors.
         mask: PNG that is black except on the car itself, which is ignored.
         any_camera: Use a network with another camera than it was trained with.
-        lane_width_cm: Between the middles of the two lines, for the lane filter.
+        lane_width_cm: Between the middles of the two lines, for the network and the lane filter.
     """
 
     rules: ClassVar[tuple[Rule, ...]] = DETECTOR_RULES
@@ -105,10 +105,18 @@ def load_drive_settings(path: Path, overrides: list[str] | None = None) -> Drive
     """
     # A path in an override counts from the working folder, as every other one on a command line.
     data = apply_overrides(with_full_paths(read_yaml(path), path), overrides or [])
-    return check_settings(DriveSettings, _with_wheelbase(data), str(path))
+    return check_settings(DriveSettings, with_wheelbase(data), str(path))
 
 
-def _with_wheelbase(data: dict[str, Any]) -> dict[str, Any]:
+def with_wheelbase(data: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a car's file with the wheelbase of its camera file, unless it has its own.
+
+    Args:
+        data: Content of the file, with full paths.
+
+    Raises:
+        CalibrationError: If the camera file is needed and cannot be used.
+    """
     control, camera = data.get("control", {}), data.get("camera")
     steering = control.get("steering", {}) if isinstance(control, dict) else None
     # Wrong types are left to check_settings, which names them.

@@ -5,12 +5,16 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from recordings import lap, write_recording
 
+from datagen.slam.settings import GuessSettings
+from lanenet.calibration.lens import camera_of_lens
 from lanenet.cli.train import run_settings_schema
 from lanenet.config import check_settings, load_settings, read_yaml
 from lanenet.errors import ConfigError
+from lanenet.geometry.camera import NOMINAL_WHEELBASE_CM
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 #: Those that ship, and those of the tests.
@@ -63,7 +67,11 @@ def read_donkeycar_pilot(path: Path) -> Any:
 def read_car(path: Path) -> Any:
     from lanenet.onboard.drive import load_drive_settings
 
-    return load_drive_settings(path)
+    # Those that are copied beside the camera file of a car have none here.
+    named = read_yaml(path).get("camera")
+    here = named is None or (path.parent / named).is_file()
+    camera = CONFIGS.parent / "checkpoints" / "small" / "camera.yaml"
+    return load_drive_settings(path, [] if here else [f"camera={camera}"])
 
 
 def read_contest(path: Path) -> Any:
@@ -144,7 +152,7 @@ def prepare_quickly(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     """
     from datagen.datasets import build, jobs
 
-    def map_drive(request: Any, settings: Any, out: Path, pictures: bool = True) -> None:
+    def map_drive(request: Any, settings: Any, out: Path, pictures: bool = True, **_: Any) -> None:
         assert request.lane_width_cm > 20.0
 
     def label_map(
@@ -301,3 +309,14 @@ def test_what_a_config_starts_from_fits_its_network_and_window(path: Path) -> No
     # As labels are made: like the map, and by colours.
     seen = data.map.perception.with_colours(data.colour_weight)
     load_start_weights(network, CONFIGS.parent / folder, data.window, seen)
+
+
+def test_the_wheelbase_is_one_number_in_all_templates() -> None:
+    """That of the camera file where there is one; else, and where nobody gave it, the nominal one."""
+    for path in [*(CONFIGS / "car").glob("*.yaml"), *(CONFIGS / "donkeycar").glob("*.yaml")]:
+        data = read_yaml(path)
+        found = data["control"]["steering"].get("wheelbase_cm")
+        assert found == (None if "camera" in data else NOMINAL_WHEELBASE_CM), path
+    assert GuessSettings().wheelbase_cm == NOMINAL_WHEELBASE_CM
+    lens = np.array([100.0, 100.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0])
+    assert camera_of_lens("fisheye", lens, (160, 120)).wheelbase_cm == NOMINAL_WHEELBASE_CM

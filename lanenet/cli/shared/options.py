@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from lanenet.errors import ConfigError
+from lanenet.geometry.camera import NOMINAL_WHEELBASE_CM
 from lanenet.geometry.lane import check_lane_width
 from lanenet.outputs import lock_output
 from lanenet.perception.registry import detector_names, listed
@@ -91,7 +92,7 @@ WheelbaseOption = Annotated[
         "--wheelbase",
         parser=length_cm,
         metavar="CM",
-        help="Distance between the car's axles, cm; default: nominally 17, of a chessboard's camera 26.",
+        help=f"Distance between the car's axles, cm; default: nominally {NOMINAL_WHEELBASE_CM:g}.",
     ),
 ]
 CameraHeightOption = Annotated[

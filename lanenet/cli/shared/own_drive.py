@@ -88,7 +88,10 @@ def own_config(
     network = LearnSettings.model_validate(read_yaml(start / CONFIG_NAME)).network
     sources = [source for path in paths for source in sources_in(path)]
     if measured.options and all(map(_is_finished, sources)):
-        raise ConfigError(f"{measured.options[0]}: is for a drive to be mapped, but {sources[0]} is finished")
+        raise ConfigError(
+            f"{measured.options[0]}: is for a drive to be mapped, but {sources[0]} is finished"
+            f"{_rescale_instead(sources[0], measured)}"
+        )
     folder = Path(replaced.get("work_dir") or runs / name).resolve()
     drives, counts = zip(*(_recording(source, measured, folder, runs) for source in sources), strict=True)
     config: dict[str, Any] = {
@@ -108,6 +111,28 @@ def own_config(
         },
     }
     return apply_overrides(config, list(overrides))
+
+
+def untrained_widths(settings: Any) -> list[str]:
+    """Warn of lanes unlike those of the network that a training starts from, as ``lanenet detect`` does.
+
+    Args:
+        settings: Of the run, see :func:`lanenet.cli.train.run_settings_schema`.
+    """
+    from lanenet.learn.export import read_network
+
+    start = settings.learn.start_from
+    widths_cm = [drive.lane_width_cm for drive in settings.data.drives]
+    return [] if start is None else read_network(start)[1].untrained_widths(widths_cm, str(start))
+
+
+def _rescale_instead(source: Path, measured: Measured) -> str:
+    """Say how a finished map gets another lane width: the end of a sentence."""
+    if measured.lane_width_cm is None or not (source / "map.yaml").is_file():
+        return ""
+    drive, width_cm = read_yaml(source / "map.yaml").get("drive"), f"{measured.lane_width_cm:g}"
+    words = ["lanenet", "map", str(drive), "--lane-width", width_cm, "--out", str(source)]
+    return f"; to rescale it, which takes seconds: {shlex.join(words)}"
 
 
 def epochs_of(frames: int) -> int:
@@ -184,6 +209,7 @@ def finished_map(drive: dict[str, Any], folder: Path, runs: Path) -> Path | None
         runs: Folder in which maps and runs lie.
     """
     from datagen.datasets.build import recorded_jobs
+    from datagen.datasets.jobs import finished_maps
     from datagen.datasets.settings import DataSettings
     from datagen.made import Output
 
@@ -191,9 +217,7 @@ def finished_map(drive: dict[str, Any], folder: Path, runs: Path) -> Path | None
     own = job.map_output
     if own.done:
         return None
-    markers = sorted([*runs.glob("*/map.done.json"), *runs.glob("*/drives/maps/*/map.done.json")])
-    maps = (marker.with_name("map.yaml") for marker in markers)
-    return next((file.parent for file in maps if Output(file, own.key).done), None)
+    return next((one for one in finished_maps(runs) if Output(one / "map.yaml", own.key).done), None)
 
 
 def check_name(checkpoint: Path, config: Path, drives: Iterable[Path]) -> None:

@@ -217,13 +217,34 @@ def test_a_drive_that_is_too_short_is_named_before_others_are_mapped(
     write_drive(here / "long", 60)
     write_drive(here / "short", 3)
 
-    def mapped(*_: object) -> None:
+    def mapped(*_: object, **__: object) -> None:
         raise AssertionError("the first one is mapped")
 
     monkeypatch.setattr("datagen.datasets.jobs.map_drive", mapped)
     words = ["train", "long", "short", "--lane-width", "40", "--name", "a"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 1 and "short: found 3 frames of a car that drives" in result.stderr
+
+
+def test_a_lane_unlike_those_that_the_network_knows_is_warned_of_at_once(here: Path) -> None:
+    """As lanenet detect does; not after the minutes that mapping takes."""
+    write_drive(here / "short", 3)
+    words = ["train", "short", "--name", "a", "--lane-width"]
+    for width, warned in (("100", True), ("40", False)):
+        result = CliRunner().invoke(app, [*words, width, "--force"])
+        assert result.exit_code == 1 and "short: found 3 frames" in result.stderr
+        assert ("lane width 100 cm: " in result.stderr) == warned
+    assert "was trained on lanes of" in CliRunner().invoke(app, [*words, "100", "--force"]).stderr
+
+
+def test_the_lane_width_of_a_finished_map_is_corrected_by_map(here: Path) -> None:
+    folder = mapped(here / "map")
+    with pytest.raises(
+        ConfigError, match=r"is finished; to rescale it.*lanenet map .* --lane-width 41 --out"
+    ):
+        config_of(folder, lane_width_cm=41.0)
+    with pytest.raises(ConfigError, match=r"is finished$"):
+        config_of(folder, wheelbase_cm=26.0)
 
 
 def test_photos_are_no_drive_and_that_is_said(here: Path) -> None:

@@ -197,7 +197,7 @@ def test_drives_that_cannot_be_mapped_are_left_out_as_far_as_allowed(tmp_path, m
 
 
 def test_a_recording_counts_as_many_drives_to_learn_from(tmp_path, monkeypatch):
-    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: None)
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_, **__: None)
     monkeypatch.setattr("datagen.datasets.jobs.label_map", lambda _, out, **__: write_labels(out, whole))
     whole = _labels(np.arange(400))
     (tmp_path / "tub").mkdir()
@@ -217,7 +217,7 @@ def test_a_recording_counts_as_many_drives_to_learn_from(tmp_path, monkeypatch):
 
 
 def test_a_whole_recording_is_learned_from_and_other_drives_choose(tmp_path, monkeypatch):
-    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: None)
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_, **__: None)
     monkeypatch.setattr("datagen.datasets.jobs.label_map", lambda _, out, **__: write_labels(out, whole))
     whole = _labels(np.arange(400))
     for seed, name in enumerate(("whole", "split")):
@@ -233,7 +233,7 @@ def test_a_whole_recording_is_learned_from_and_other_drives_choose(tmp_path, mon
 
 
 def test_a_map_is_taken_as_it_is(tmp_path, monkeypatch):
-    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: pytest.fail("mapped again"))
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_, **__: pytest.fail("mapped again"))
     monkeypatch.setattr(
         "datagen.datasets.jobs.label_map",
         lambda folder, out, **__: write_labels(out, _labels(np.arange(read_map(folder).frames.size))),
@@ -245,7 +245,9 @@ def test_a_map_is_taken_as_it_is(tmp_path, monkeypatch):
     assert [(part.role, part.frames) for part in parts] == [("train", drive_map)]
     assert len(read_labels(parts[0].labels)) == read_map(drive_map).frames.size
     other = recorded.model_copy(update={"lane_width_cm": 40.0})
-    with pytest.raises(ConfigError, match="map of a lane of 36 cm, but lane_width_cm is 40"):
+    with pytest.raises(
+        ConfigError, match=r"map of a lane of 36 cm, but lane_width_cm is 40.*rescale it in.*lanenet map"
+    ):
         RecordedJob(other, DataSettings(), tmp_path / "work").run()
 
 
@@ -293,7 +295,7 @@ def test_drives_have_names_for_people(tmp_path):
 def test_a_recorded_drive_is_mapped_again_only_when_something_changed(tmp_path, monkeypatch):
     made: list[str] = []
 
-    def map_drive(request: MapRequest, map_settings: object, out: Path, progress: None) -> None:
+    def map_drive(request: MapRequest, _: object, out: Path, progress: None, earlier: list[Path]) -> None:
         made.append("map")
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
@@ -373,7 +375,7 @@ def test_a_map_stays_known_while_one_of_another_width_is_made(tmp_path, monkeypa
     (narrow.frames / "map.yaml").write_text("a map")
     narrow.map_output.mark()
 
-    def interrupted(*_):
+    def interrupted(*_, **__: object):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("datagen.datasets.jobs.map_drive", interrupted)

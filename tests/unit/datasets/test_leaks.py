@@ -234,7 +234,7 @@ def test_a_split_says_which_parts_a_drive_is_in() -> None:
 def test_whole_drives_make_the_parts_of_a_run(
     drives: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_: None)
+    monkeypatch.setattr("datagen.datasets.jobs.map_drive", lambda *_, **__: None)
     monkeypatch.setattr("datagen.datasets.jobs.label_map", lambda _, out, **__: _labels(out, 1, slice(0, 80)))
     write_recording(tmp_path / "yard", lap(5, 60))
     names = {"train": "whole", "validation": "lap", "test": "yard"}

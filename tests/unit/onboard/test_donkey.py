@@ -12,6 +12,7 @@ import pytest
 from lanenet.config import check_settings, load_settings
 from lanenet.control.controller import ControlSettings
 from lanenet.control.steering import SteeringSettings
+from lanenet.data.camera_file import read_camera
 from lanenet.errors import CalibrationError, ConfigError, ModelMismatchError
 from lanenet.onboard.donkey import (
     BirdseyeTransformer,
@@ -220,7 +221,9 @@ def test_doubtful_frame_counts_as_none(pilot):
 
 
 def test_shipped_settings_drive_on_the_example(example_rgb):
-    settings = load_settings(DonkeySettings, CONFIG).model_copy(update={"allow_repeated_frames": True})
+    settings = load_settings(DonkeySettings, CONFIG, ["control.steering.wheelbase_cm=26"]).model_copy(
+        update={"allow_repeated_frames": True}
+    )
     pilot = LanePilot(settings, CONFIG.parent, clock=Clock())
     throttles = [pilot.run(example_rgb)[1] for _ in range(20)]
     assert np.diff(throttles).max() <= 0.0501, "the throttle rises by 1 per second at most"
@@ -317,8 +320,23 @@ def test_what_is_missing_is_named(tmp_path):
         check_settings(DonkeySettings, {"control": control, "min_confidenc": 1}, "lanenet.yaml")
 
 
+def test_the_wheelbase_is_the_cameras_unless_the_file_says(tmp_path):
+    """One number: that of the map, which stands in the camera file. No template has another one."""
+    camera = (CHECKPOINT / "camera.yaml").read_text()
+    (tmp_path / "camera.yaml").write_text(camera)
+    pilot = CONFIG.read_text().replace("../../checkpoints/small/camera.yaml", "camera.yaml")
+    pilot = pilot.replace("../../checkpoints/small", str(CHECKPOINT))
+    for name, steering in (("own", "{}"), ("given", "{wheelbase_cm: 21}")):
+        (tmp_path / f"{name}.yaml").write_text(pilot.replace("steering: {}", f"steering: {steering}"))
+    found = [
+        LanePilot.from_file(tmp_path / f"{name}.yaml")._settings.control.steering.wheelbase_cm
+        for name in ("own", "given")
+    ]
+    assert found == [read_camera(CHECKPOINT / "camera.yaml").wheelbase_cm, 21.0]
+
+
 def test_model_of_another_camera_is_refused(tmp_path):
-    settings = load_settings(DonkeySettings, CONFIG)
+    settings = load_settings(DonkeySettings, CONFIG, ["control.steering.wheelbase_cm=26"])
     text = (CHECKPOINT / "camera.yaml").read_text().replace("height_cm: ", "height_cm: 1")
     (tmp_path / "camera.yaml").write_text(text)
     other = settings.model_copy(update={"camera": tmp_path / "camera.yaml"})
