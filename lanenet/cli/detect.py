@@ -25,7 +25,7 @@ from lanenet.cli.shared.options import (
 from lanenet.cli.shared.standing import next_on_car
 from lanenet.cli.shared.viewing import NO_VIEWS, Views, with_viewers
 from lanenet.config import read_yaml
-from lanenet.errors import CalibrationError, DriveFormatError, counted
+from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, counted
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import (
@@ -202,6 +202,9 @@ def detect_lanes(asked: Asked, views: Views = NO_VIEWS) -> tuple[DetectReport, D
     check_table_path(out)
     whole, of_map = _open(source, out, video)
     camera = asked.camera or of_map
+    if asked.camera is not None:
+        earlier = _other_recording(asked.camera, Path(whole.name))
+        console.show_problems([f"{why}; its camera is used all the same" for why in earlier])
     opened = whole if asked.frames is None else whole.numbered(*asked.frames)
     used_camera = read_camera(camera) if camera is not None else opened.camera
     if used_camera is not None:
@@ -267,20 +270,36 @@ def _open(source: Path, *outs: Path | None) -> tuple[Source, Path | None]:
             f"--camera {source}"
         )
     check_not_source(drive, *outs)
+    if other := _other_recording(source, drive):
+        raise DriveFormatError(f"{other[0]}; for the map's camera alone give {drive} with --camera {source}")
     console.say(f"{source} is a map: its drive {drive} is read, with its camera and lane width")
     return replace(open_source(drive), lane_width_cm=meta.lane_cm), source
 
 
 def _map_of(camera: Path | None, drive: Path) -> MapToSee | None:
     """Open the map of a drive, where the camera was given as that map; None otherwise."""
-    file = None if camera is None else camera / "map.yaml"
-    if camera is None or file is None or not file.is_file():
-        return None
-    if Path(str(read_yaml(file).get("drive"))).resolve() != drive.resolve():
+    if camera is None or not _is_map_of(camera, drive):
         return None
     from lanenet.viewers.mapped import MapToSee
 
     return MapToSee(camera)
+
+
+def _is_map_of(folder: Path, drive: Path) -> bool:
+    file = folder / "map.yaml"
+    return file.is_file() and Path(str(read_yaml(file).get("drive"))).resolve() == drive.resolve()
+
+
+def _other_recording(folder: Path, drive: Path) -> list[str]:
+    """Say that a map was made of an earlier recording in the drive's folder; nothing if it was not."""
+    if not _is_map_of(folder, drive):
+        return []
+    try:
+        from lanenet.data.maps.mapped_drive import recorded_anew
+
+        return recorded_anew(folder)
+    except (ImportError, LanenetError):  # the car has no SciPy; and the camera of a damaged map is whole
+        return []
 
 
 def _watch(

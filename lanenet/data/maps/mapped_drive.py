@@ -161,6 +161,22 @@ def check_images(mapped: MappedDrive, map_folder: Path, every: bool = False) -> 
         )
 
 
+def recorded_anew(map_folder: Path) -> list[str]:
+    """Say why the drive of a map is not the one that was mapped; nothing if it is, or is not known to be."""
+    drive_map = read_map(map_folder)
+    drive = open_drive(Path(drive_map.meta.drive))
+    rows = np.flatnonzero(np.isin(drive.frames, drive_map.frames))
+    if len(rows) < len(drive_map.frames):
+        return [
+            f"{drive.path}: {len(drive_map.frames) - len(rows)} frames of {map_folder} are not in it any more"
+        ]
+    try:
+        check_images(MappedDrive(drive_map, drive, rows, PerceptionSettings()), map_folder)
+    except DriveFormatError as error:
+        return [str(error)]
+    return []
+
+
 @cache
 def _warn(text: str) -> None:
     """Log a warning once: a command opens its map several times."""

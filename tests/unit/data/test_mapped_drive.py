@@ -7,6 +7,7 @@ import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -176,6 +177,22 @@ def test_a_drive_that_was_recorded_anew_is_refused_by_every_reader_of_its_map(fo
         with pytest.raises(DriveFormatError, match=said):
             read()
     assert not (tmp_path / "l.parquet").exists()
+
+
+def test_detect_says_that_a_map_is_of_an_earlier_recording(folder, tmp_path):
+    drive = with_marks(folder)
+    words = ["--detector", "hough", "--out", str(tmp_path / "a.csv")]
+
+    def run(*source: object) -> Any:
+        return CliRunner().invoke(app, ["detect", *map(str, source), *words], env={"COLUMNS": "2000"})
+
+    assert run(folder).exit_code == 0 and "anew" not in run(drive.path, "--camera", folder).stderr
+    record_anew(drive)
+    refused = run(folder)
+    assert refused.exit_code == 1
+    assert "recorded anew" in refused.stderr and f"give {drive.path} with --camera {folder}" in refused.stderr
+    found = run(drive.path, "--camera", folder)
+    assert found.exit_code == 0 and "its camera is used all the same" in found.stderr
 
 
 def test_one_other_image_is_never_labelled(folder, tmp_path):
