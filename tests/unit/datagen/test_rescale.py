@@ -138,9 +138,6 @@ def test_what_is_judged_in_centimetres_is_judged_anew(drive: Path, map_40: Path)
     assert "beside the window" in found and "beside the window" not in str(before["verdict"]["reasons"])
     assert report.figures["labelled"]["share"] < 0.8 < 0.9 < before["labelled"]["share"]
     assert report.figures["camera"]["height_cm"] == pytest.approx(3.0 * before["camera"]["height_cm"])
-    # Pixels are pixels.
-    sd_px = [f["held_out"]["both_lines"]["robust_sd_px"] for f in (before, report.figures)]
-    assert sd_px[0] == pytest.approx(sd_px[1], rel=0.5)
 
 
 @pytest.mark.parametrize(
