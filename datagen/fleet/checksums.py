@@ -48,8 +48,12 @@ def checksums_now(sources: Iterable[str], storage: Storage) -> dict[str, str]:
 
 def _known(storage: Storage) -> dict[str, list[str]]:
     """Return what stands for size and time of each drive's files, and their checksum."""
-    known: dict[str, list[str]] = json.loads(storage.read(CHECKSUMS_NAME) or b"{}")
-    return known
+    try:
+        known = json.loads(storage.read(CHECKSUMS_NAME) or b"{}")
+    except (ValueError, RecursionError):  # torn by a power cut: the files are read once more
+        return {}
+    pairs = known.items() if isinstance(known, dict) else ()
+    return {source: pair for source, pair in pairs if isinstance(pair, list) and len(pair) == 2}
 
 
 def _pair(source: str, known: dict[str, list[str]]) -> list[str] | None:

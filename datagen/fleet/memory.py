@@ -29,7 +29,7 @@ def memory_bytes(source: str) -> int:
         return stated_bytes(max(len(drive_files(source)), _UNSEEN_FRAMES), MOST_IMAGE_BYTES)
     try:
         drive = open_drive(path)
-    except LanenetError:  # it will be refused
+    except (LanenetError, OSError):  # it will be refused
         return _FIXED
     return stated_bytes(len(drive), drive.width * drive.height)
 

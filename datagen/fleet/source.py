@@ -25,6 +25,8 @@ _BLOCK = 1 << 20
 def drive_files(source: str) -> dict[str, str]:
     """Return the files of a drive with what changes when they do: size, and time or hash of the storage.
 
+    Pipes, devices and links that lead nowhere are no files: reading them may never end.
+
     Args:
         source: Path or URL of a folder, or of a file with those beside it that belong to it.
 
@@ -45,6 +47,9 @@ def drive_files(source: str) -> dict[str, str]:
             if "{stem}" in name
         ]
         found = {file: system.info(file) for file in [path, *filter(system.exists, dict.fromkeys(beside))]}
+    found = {name: info for name, info in found.items() if info["type"] == "file"}
+    if not found:
+        raise DriveFormatError(f"{source}: holds no file, expected a drive")
     return {
         name: json.dumps([info["size"], str(info.get("ETag") or info.get("mtime") or info.get("created"))])
         for name, info in sorted(found.items())
@@ -70,7 +75,8 @@ def checksum(source: str) -> str:
             if system.isdir(path)
             else PurePosixPath(file).name.partition(".")[2]
         )
-        whole.update(f"{inside}\0{digest.hexdigest()}\n".encode())
+        # Names of other systems need not be UTF-8.
+        whole.update(f"{inside}\0{digest.hexdigest()}\n".encode(errors="surrogatepass"))
     return whole.hexdigest()
 
 

@@ -25,7 +25,8 @@ from lanenet.cli.shared.own_drive import sources_in
 from lanenet.config import load_settings
 from lanenet.data.drives import open_drive
 from lanenet.data.library.entry import name_of
-from lanenet.errors import ConfigError, LanenetError, counted
+from lanenet.errors import ConfigError, DriveFormatError, LanenetError, counted
+from lanenet.reading import is_folder, is_regular
 
 if TYPE_CHECKING:
     from datagen.fleet.engine import Engine
@@ -290,13 +291,29 @@ def _own_width_cm(source: str) -> float | None:
         return None
     try:
         return open_drive(Path(source)).lane_width_cm
-    except LanenetError:  # it will be refused
+    except (LanenetError, OSError):  # it will be refused, and the others done
         return None
 
 
 def found_in(source: str) -> list[str]:
-    """Return the drives that a path or URL names: a drive, or those in a folder, by their full paths."""
-    return [source] if "://" in source else [str(path.resolve()) for path in sources_in(Path(source))]
+    """Return the drives that a path or URL names: a drive, or those in a folder, by their full paths.
+
+    What cannot be read, or is a pipe or a device, is a drive that fails: it does not stop the others.
+
+    Raises:
+        DriveFormatError: If it is a file or a folder, and no drive.
+    """
+    if "://" in source:
+        return [source]
+    path = Path(source)
+    try:
+        return [str(each.resolve()) for each in sources_in(path)]
+    except OSError:
+        return [str(path.absolute())]
+    except DriveFormatError:
+        if path.exists() and not is_regular(path) and not is_folder(path):
+            return [str(path.absolute())]
+        raise
 
 
 def named(sources: Sequence[str], others: Sequence[FleetDrive] = ()) -> dict[str, str]:

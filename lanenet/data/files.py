@@ -12,6 +12,7 @@ import importlib
 import json
 import math
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -208,9 +209,10 @@ def json_text(obj: Any) -> str:
     """Return indented JSON.
 
     Accepts NumPy arrays and numbers, paths, tuples and nested containers. Floats that are not finite become
-    null: JSON has no value for them.
+    null: JSON has no value for them. Halves of characters, as in names that are no UTF-8, are escaped.
     """
-    return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    text = json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    return re.sub("[\ud800-\udfff]", lambda half: f"\\u{ord(half[0]):04x}", text)
 
 
 def write_json(path: Path, obj: Any) -> None:

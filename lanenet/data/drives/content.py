@@ -123,7 +123,9 @@ def content_key(path: Path) -> str:
     unread, whole = {*photos} - sampled, hashlib.sha256()
     for file in files:
         read = file not in unread and file.is_file()
-        whole.update(f"{file.relative_to(path)}\0{file_mark(file) if read else _size(file)}\n".encode())
+        mark = file_mark(file) if read else _size(file)
+        # Names of other systems need not be UTF-8.
+        whole.update(f"{file.relative_to(path)}\0{mark}\n".encode(errors="surrogatepass"))
     return whole.hexdigest()
 
 
