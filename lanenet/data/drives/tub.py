@@ -18,7 +18,7 @@ from lanenet.data.drives.recording import DRIVE_FILE, Commands, DriveFormat, Ima
 from lanenet.data.drives.tub_index import CATALOGS, MANIFEST_FILE, read_index
 from lanenet.data.drives.tub_rows import Record, ordered, read_catalog
 from lanenet.errors import DriveFormatError
-from lanenet.reading import FolderFiles, is_regular
+from lanenet.reading import FolderFiles, first_line, is_folder, is_regular
 
 #: Used where the timestamps cannot be those of the frames: Donkeycar's default rate (DRIVE_LOOP_HZ = 20).
 DEFAULT_PERIOD_S = 0.05
@@ -143,16 +143,19 @@ def _image_names(folder: Path, inside: FolderFiles) -> set[str]:
     Raises:
         DriveFormatError: If the folder itself, or a link in it, leads out of the tub.
     """
-    if not folder.is_dir():
+    if not is_folder(folder):
         return set()
     names: set[str] = set()
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            # The rest lies where the folder does.
-            if not names or entry.is_symlink():
-                inside.file(f"{folder.name}/{entry.name}", folder, DriveFormatError)
-            if entry.is_file():
-                names.add(entry.name)
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                # The rest lies where the folder does.
+                if not names or entry.is_symlink():
+                    inside.file(f"{folder.name}/{entry.name}", folder, DriveFormatError)
+                if entry.is_file():
+                    names.add(entry.name)
+    except OSError as error:
+        raise DriveFormatError(f"{folder}: cannot be read ({first_line(error)})") from None
     return names
 
 
