@@ -214,14 +214,16 @@ def solve_drive(prepared: PreparedDrive, camera: CameraOfDrive, solver: SegmentS
     """
     drive = prepared.drive
     found = segments_of(camera.solved or solver.solve(drive, camera.camera))
+    tied = np.concatenate([one.rows for one in found])
+    untied = np.setdiff1d(np.arange(len(drive)), tied)
     if len(found[0].rows) < LEAST_FRAMES:
+        more = f", and {counted(len(untied), 'frame')} that nothing ties to others" if len(untied) else ""
         raise TrackingLostError(
-            f"{drive.path}: {len(drive)} frames in {len(found)} parts that show no place of each other, the "
-            f"longest of {len(found[0].rows)} frames; mapping needs {LEAST_FRAMES}"
+            f"{drive.path}: {len(tied)} frames in {counted(len(found), 'part')} that show no place of each "
+            f"other, the longest of {len(found[0].rows)} frames{more}; mapping needs {LEAST_FRAMES}"
         )
     kept = sorted((one for one in found if len(one.rows) >= LEAST_FRAMES), key=lambda one: int(one.rows[0]))
     short = [one.rows for one in found if len(one.rows) < LEAST_FRAMES]
-    untied = np.setdiff1d(np.arange(len(drive)), np.concatenate([one.rows for one in found]))
     refused = []
     if short:
         rows, parts = np.sort(np.concatenate(short)), f" in {len(short)} parts" if len(short) > 1 else ""

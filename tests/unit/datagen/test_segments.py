@@ -103,6 +103,15 @@ def test_frames_that_nothing_ties_are_said_in_one_note_as_are_short_parts(monkey
         drive_segments.fit_lanes(prepared, solved.segments, [replace(solved.refused[0], rows=np.arange(300))])
 
 
+def test_a_drive_of_which_little_is_tied_says_how_much(monkeypatch):
+    drive = made_up_drive(150, [4])
+    few = _in_parts(drive, []).only(np.arange(4))
+    monkeypatch.setattr(SegmentSolver, "solve", lambda self, part, camera: few)
+    prepared, solver = _prepared(drive), SegmentSolver(SETTINGS, np.random.default_rng(0))
+    with pytest.raises(TrackingLostError, match=r"4 frames in 1 part .*, and 146 frames that nothing ties"):
+        drive_segments.solve_drive(prepared, drive_segments.CameraOfDrive(CAMERA), solver)
+
+
 def _no_lane(segment: SolvedSegment, *_: object) -> MappedSegment:
     raise TrackingLostError(f"no lane in {len(segment.rows)} frames")
 
