@@ -27,7 +27,7 @@ from lanenet.errors import HardwareError, LanenetError
 from lanenet.onboard.actuators.actuator import Actuator, Spare
 from lanenet.onboard.guard_process import DRIVE, MESSAGE, NEUTRAL, QUIT
 from lanenet.onboard.i2c import GUARD_MODULE
-from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
+from lanenet.onboard.neutral import AGAIN_S, HOLD_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
 from lanenet.search_path import without_working_folder
 
 log = logging.getLogger(__name__)
@@ -258,7 +258,10 @@ class GuardedActuator:
                 self._kill()
                 # A guard that died while it started may have left the motor of an earlier drive running.
                 if self._ready or self._spare is not None:
-                    self._left = settle(self._rescue, patience_s=max(end_s - time.monotonic(), 0.0))
+                    left_s = max(end_s - time.monotonic(), 0.0)
+                    # A line of its own is nobody else's.
+                    hold_s = 0.0 if self._spare is None else HOLD_S
+                    self._left = settle(self._rescue, patience_s=left_s, hold_s=hold_s)
             if self._watch is not None:
                 self._watch.end()
         try:

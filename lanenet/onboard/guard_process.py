@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from lanenet.errors import LanenetError, MotorMayRunError
 from lanenet.onboard.i2c import I2CChip
-from lanenet.onboard.neutral import Neutral, reach_neutral, settle
+from lanenet.onboard.neutral import HOLD_S, Neutral, reach_neutral, settle
 
 if TYPE_CHECKING:
     from lanenet.onboard.actuators.actuator import Actuator
@@ -375,7 +375,7 @@ def _leave(actuator: Actuator, pulse: int) -> Neutral | None:
 
     # A board whose plug slipped is opened again; one that could not be opened at all is left alone.
     reached = actuator.neutral() is not None
-    left = settle(partial(reach_neutral, actuator), turn) if reached else None
+    left = settle(partial(reach_neutral, actuator), turn, hold_s=HOLD_S) if reached else None
     if left is None or left.confirmed is not False:
         _close(actuator)
     return left

@@ -159,14 +159,21 @@ def describe_process(pid: int) -> str:
     text = f"process {pid} ({' '.join(words)[:60]})"
     if GUARD_MODULE not in words:
         return text
+    # It may have ended since.
+    parent = parent_of(pid)
+    if not parent:
+        return text
+    return f"process {pid}, the guard of process {parent} ({' '.join(words_of(parent))[:60]})"
+
+
+def parent_of(pid: int) -> int:
+    """Return the parent of a process; 0 if it is gone."""
     try:
         status = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:
-        # It ended since.
-        return text
+        return 0
     # "pid (name) state parent ..."; the name may hold anything.
-    parent = int(status.rpartition(")")[2].split()[1])
-    return f"process {pid}, the guard of process {parent} ({' '.join(words_of(parent))[:60]})"
+    return int(status.rpartition(")")[2].split()[1])
 
 
 def words_of(pid: int) -> list[str]:

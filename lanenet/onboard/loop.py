@@ -186,7 +186,11 @@ class DriveLoop:
                 state = "ended" if left is None else left.may_run if may_run else left.text
                 level = logging.INFO if failure is None and not may_run else logging.ERROR
                 log.log(level, "%s: %s", state, self.report.ended)
-                failure = self._close() or failure
+                unclosed = self._close()
+        if unclosed is not None and self._asked:
+            log.error("while it was closed: %s", unclosed)
+        elif unclosed is not None:
+            failure = failure or unclosed
         if may_run:
             raise MotorMayRunError(f"{state}; ended: {self.report.ended}") from failure
         if failure is not None:

@@ -6,6 +6,7 @@ Imports little: the guard and ``lanenet stop`` need it before anything else.
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import threading
 import time
@@ -27,6 +28,9 @@ PATIENCE_S = 15.0
 SENT_S = 0.5
 #: Between two attempts; a command takes a few milliseconds.
 AGAIN_S = 0.01
+#: Neutral has to hold for this long at the end of a drive: another program that moves the car, as Donkeycar's
+#: loop does 20 times per second, has written again by then.
+HOLD_S = 0.25
 
 
 class Neutral(NamedTuple):
@@ -61,6 +65,7 @@ def settle(
     neutral: Callable[[], Neutral | None],
     turn: Callable[[], bool] | None = None,
     patience_s: float | None = None,
+    hold_s: float = 0.0,
 ) -> Neutral | None:
     """Repeat neutral until the hardware confirms it, or the time is over.
 
@@ -71,11 +76,13 @@ def settle(
         turn: Called after the first attempt, and then every ``AGAIN_S``; no answer counts of an attempt that
             began before it has returned True. None for a device that nobody else drives.
         patience_s: Longest time, [s], ``PATIENCE_S`` by default; ``SENT_S`` where nothing can be read back.
+        hold_s: For this long all attempts have to be confirmed, [s].
 
     Returns:
         The last attempt's answer; None if the device is not open.
     """
-    answer: Neutral | None = Neutral(False, "the actuator's driver does not return")
+    doubt, since_s = Neutral(False, "the actuator's driver does not return"), math.inf
+    answer: Neutral | None = doubt
     begun = done = 0
     over, fresh = threading.Event(), threading.Event()
 
@@ -99,15 +106,23 @@ def settle(
         while True:
             fresh.wait(AGAIN_S)
             fresh.clear()
-            if counts and done > ignored and (answer is None or answer.confirmed):
-                return answer
-            passed_s = time.monotonic() - start_s
+            now_s = time.monotonic()
+            passed_s, holds = now_s - start_s, counts and done > ignored
+            if holds and (answer is None or answer.confirmed):
+                since_s = min(since_s, now_s)
+                if answer is None or now_s - since_s >= hold_s:
+                    return answer
+            elif holds:
+                since_s = math.inf
+            if answer is not None and not answer.confirmed:
+                doubt = answer
             unreadable = counts and answer is not None and answer.confirmed is None
             if passed_s >= (SENT_S if unreadable else patience_s):
-                return answer if counts else Neutral(False, "its owner has not ended")
-            if not told and passed_s >= SENT_S and answer is not None:
+                return doubt if counts else Neutral(False, "what drives has not ended")
+            if not told and passed_s >= SENT_S and answer is not None and not unreadable:
                 told = True
-                log.warning("%s; tried for %g s", answer.text if unreadable else answer.may_run, patience_s)
+                text = doubt.may_run if counts else "neutral is sent until what drives has ended"
+                log.warning("%s; tried for %g s", text, patience_s)
             if turn is not None:
                 if (agreed := turn()) and not counts:
                     # An attempt that had begun before may have been undone since.

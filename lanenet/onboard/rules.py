@@ -119,11 +119,12 @@ CAR_RULES = (
     _until_the_next_frame("watchdog_s"),
     _until_the_next_frame("max_age_s"),
     Rule(
-        ("source.delay_s", "safety.max_age_s"),
-        lambda s: s.source.delay_s is None or s.source.delay_s < s.safety.max_age_s,
+        ("source.delay_s", "source.rate_hz", "safety.max_age_s"),
+        lambda s: s.source.delay_s is None or s.source.delay_s + 1.0 / s.source.rate_hz < s.safety.max_age_s,
         lambda s: (
-            f"expected source.delay_s below {s.safety.max_age_s:g} s, or every frame is too old when it "
-            "arrives; raise safety.max_age_s, or take a camera with less delay"
+            f"expected source.delay_s and the {1.0 / s.source.rate_hz:.3g} s between two frames together "
+            f"below {s.safety.max_age_s:g} s, or each command runs out before the next; raise "
+            "safety.max_age_s, or take a camera with less delay"
         ),
     ),
 )

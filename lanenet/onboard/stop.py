@@ -21,8 +21,15 @@ from typing import TYPE_CHECKING
 
 from lanenet.errors import ConfigError, HardwareError, LanenetError, MotorMayRunError, printable
 from lanenet.onboard.car_file import with_full_paths
-from lanenet.onboard.i2c import GUARD_MODULE, I2CChip, describe_process, lock_owners, words_of
-from lanenet.onboard.neutral import AGAIN_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
+from lanenet.onboard.i2c import (
+    GUARD_MODULE,
+    I2CChip,
+    describe_process,
+    lock_owners,
+    parent_of,
+    words_of,
+)
+from lanenet.onboard.neutral import AGAIN_S, HOLD_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
 from lanenet.reading import MEBIBYTE, read_text
 
 log = logging.getLogger(__name__)
@@ -82,10 +89,11 @@ def stop_car(
         MissingExtraError: If its driver is not installed.
     """
     told = _tell_drives(path)
-    owner = "" if any(override.startswith("actuator") for override in overrides) else _tell_owner(path)
+    elsewhere = any(override.startswith("actuator") for override in overrides)
+    owner, guarded = ("", 0) if elsewhere else _tell_owner(path)
     try:
         with undisturbed():
-            done = _stop_actuator(path, overrides)
+            done = _stop_actuator(path, overrides, guarded)
     except LanenetError as error:
         if isinstance(error, MotorMayRunError):
             # Ending the drives takes longer.
@@ -100,7 +108,8 @@ def stop_car(
             done = ["no drive of lanenet was found"]
         raise type(error)("; ".join([str(error), *done])) from None
     say(done[0])
-    if owner and not any(owner in line for line in done):
+    # A process that ends has no words any more.
+    if owner and not any(" ".join(owner.split()[:2]) in line for line in done):
         done.append(f"ended {owner}")
     done += _end_drives(path, told)
     if len(done) == 1:
@@ -131,11 +140,11 @@ def _tell_drives(path: Path) -> dict[int, str]:
     return drives
 
 
-def _tell_owner(path: Path) -> str:
+def _tell_owner(path: Path) -> tuple[str, int]:
     """Ask the owner of the file's device to end: it is in neutral before the settings are checked.
 
     Returns:
-        What it is; empty if there is none, or it is not known yet.
+        What it is, empty if there is none or it is not known yet; and the process that it guards, or 0.
     """
     import yaml
 
@@ -152,11 +161,19 @@ def _tell_owner(path: Path) -> str:
             chip.open()
             pid = chip.owner()
             chip.close()
-        text = describe_process(pid)
+        text, guarded = describe_process(pid), _guarded_by(pid)
         if pid > 0 and pid != os.getpid():
             _tell(pid, signal.SIGTERM)
-            return text
-    return ""
+            return text, guarded
+    return "", 0
+
+
+def _guarded_by(pid: int) -> int:
+    """Return the process of the drive whose guard a process is; 0 if it is none, or its drive is gone."""
+    if pid <= 0 or GUARD_MODULE not in words_of(pid):
+        return 0
+    parent = parent_of(pid)
+    return 0 if parent in (1, os.getpid()) else parent
 
 
 def _children(pid: int) -> list[int]:
@@ -166,7 +183,7 @@ def _children(pid: int) -> list[int]:
         return []
 
 
-def _stop_actuator(path: Path, overrides: Sequence[str]) -> list[str]:
+def _stop_actuator(path: Path, overrides: Sequence[str], guarded: int) -> list[str]:
     """Bring the actuator of a car's file into neutral and end its owner; returns what was done."""
     from lanenet.onboard.actuators import make_actuator
     from lanenet.onboard.actuators.pca9685 import PCA9685
@@ -187,12 +204,15 @@ def _stop_actuator(path: Path, overrides: Sequence[str]) -> list[str]:
                 return next((pid for pid in lock_owners(port.stat()) if pid != os.getpid()), 0)
             return 0
 
-        return _confirm(partial(_ask_board, actuator, owner), owner)
+        return _confirm(partial(_ask_board, actuator, owner), owner, guarded)
     if not isinstance(actuator, PCA9685):
         return [f"an actuator of kind {settings.kind} has no motor"]
     try:
-        actuator.attach()
-        return _confirm(actuator.neutral, actuator.owner)
+        try:
+            actuator.attach()
+        except HardwareError as error:
+            raise MotorMayRunError(Neutral(False, str(error)).may_run) from None
+        return _confirm(actuator.neutral, actuator.owner, guarded)
     finally:
         actuator.release()
 
@@ -211,15 +231,18 @@ def _ask_board(board: SerialBoard, owner: Callable[[], int]) -> Neutral | None:
         board.close()
 
 
-def _confirm(neutral: Callable[[], Neutral | None], owner: Callable[[], int]) -> list[str]:
-    """Repeat neutral until it is confirmed while nobody owns the device; returns what was done.
+def _confirm(neutral: Callable[[], Neutral | None], owner: Callable[[], int], guarded: int) -> list[str]:
+    """Repeat neutral until it is confirmed while nobody owns the device or takes over from its guard.
+
+    Returns:
+        What was done.
 
     Raises:
         HardwareError: If the owner cannot be ended.
         MotorMayRunError: If neutral was not confirmed.
     """
-    ending = _Ending(owner)
-    left = settle(neutral, ending.turn) or Neutral(False, "the device is not open")
+    ending = _Ending(owner, guarded=guarded)
+    left = settle(neutral, ending.turn, hold_s=HOLD_S) or Neutral(False, "the device is not open")
     if left.confirmed is False:
         raise MotorMayRunError(left.may_run)
     return [left.text, *(f"ended {text}" for text in ending.ended)]
@@ -233,10 +256,12 @@ class _Ending:
         forced: Whether one of them had to be killed.
     """
 
-    def __init__(self, owner: Callable[[], int], patience_s: float = _END_S) -> None:
+    def __init__(self, owner: Callable[[], int], patience_s: float = _END_S, guarded: int = 0) -> None:
         self.ended: list[str] = []
         self.forced = False
         self._owner, self._patience_s = owner, patience_s
+        #: The drive, which takes over from its guard and says itself what became of neutral.
+        self._guarded = guarded, describe_process(guarded)
         self._pid, self._text, self._since_s = 0, "", 0.0
         self._signals = [signal.SIGKILL, signal.SIGTERM]
 
@@ -251,9 +276,11 @@ class _Ending:
             if self._pid:
                 self.ended.append(self._text)
             self._pid, self._text, self._since_s = pid, describe_process(pid), -1.0
+            if guarded := _guarded_by(pid):
+                self._guarded = guarded, describe_process(guarded)
             self._signals = [signal.SIGKILL, signal.SIGTERM]
         if not pid:
-            return True
+            return not _runs(*self._guarded)
         if pid < 0:
             raise MotorMayRunError(
                 f"{self._text} still drives, which cannot be seen from here; disconnect the battery"

@@ -30,6 +30,9 @@ RESTART, EXTCLK, AUTO_INCREMENT, SLEEP = 0x80, 0x40, 0x20, 0x10
 OUTDRV, _MODE2_USED = 0x04, 0x1F
 OSCILLATOR_HZ = 25e6
 COUNTS = 4096
+#: A chip in neutral is read this often before neutral is sent again, for what another program has written;
+#: chosen: some milliseconds in all.
+_WATCHED = 3
 #: After every write of the start; the oscillator needs 0.5 ms to start after sleep.
 PAUSE_S = 0.001
 #: GPIO lines of the two I2C buses on a Raspberry Pi's header.
@@ -154,6 +157,8 @@ class PCA9685:
         self._neutral = neutral_writes(settings)
         #: What the two outputs hold as far as this program has written them.
         self._held = list(self._neutral)
+        #: Whether the chip held neutral when it was last read.
+        self._is_neutral = False
         #: Counts calls of ``neutral``, so that a command that hung meanwhile does not undo it.
         self._stops = 0
 
@@ -221,6 +226,7 @@ class PCA9685:
                         _pulse_write(settings, settings.throttle_channel, pulses.throttle_us),
                         _pulse_write(settings, settings.steering_channel, pulses.steering_us),
                     ]
+                    self._is_neutral = False
                     for data in reversed(self._held):
                         chip.write(data)
                 if stops != self._stops:
@@ -251,13 +257,18 @@ class PCA9685:
             return None
         with brief_lock(self._lock):
             try:
-                self._held = list(self._neutral)
+                # What held neutral before still does, unless somebody else writes to the chip.
+                foreign = ""
+                for _ in range(_WATCHED if self._is_neutral else 0):
+                    foreign = foreign or self._differences(chip)
+                self._is_neutral, self._held = False, list(self._neutral)
                 for data in self._neutral:
                     chip.write(data)
-                wrong = self._differences(chip)
-                if wrong:
+                if self._wrong_registers(chip) and self._wrong_registers(chip):
                     self._start(chip)
-                    wrong = self._differences(chip)
+                wrong = self._differences(chip)
+                self._is_neutral = not wrong
+                wrong = wrong or (foreign and f"another program writes to it: {foreign}")
             except Exception as error:
                 wrong = self._silence(error)
         if wrong:
@@ -313,20 +324,7 @@ class PCA9685:
         return self._compare(chip, held) and self._compare(chip, held)
 
     def _compare(self, chip: I2CChip, held: Sequence[bytes]) -> str:
-        mode1, mode2 = chip.read(MODE1, 2)
-        prescale = chip.read(PRE_SCALE, 1)[0]
-        if mode1 & SLEEP:
-            return "the chip sleeps, as after a restart, and sends no pulses"
-        registers = (
-            ("MODE1", mode1 & (EXTCLK | AUTO_INCREMENT), AUTO_INCREMENT),
-            ("MODE2", mode2 & _MODE2_USED, OUTDRV),
-            ("PRE_SCALE", prescale, prescale_of(self._settings.frequency_hz)),
-        )
-        wrong = [
-            f"register {name} holds {found}, expected {expected}"
-            for name, found, expected in registers
-            if found != expected
-        ]
+        wrong = self._wrong_registers(chip)
         for allowed in zip(self._neutral, held or self._neutral, strict=True):
             output = allowed[0][0]
             data = chip.read(output, 4)
@@ -335,3 +333,19 @@ class PCA9685:
                 high = f"{off} counts" if not on else f"{off} counts from {on} on"
                 wrong.append(f"channel {(output - LED0_ON_L) // 4} holds {high}")
         return " and ".join(wrong)
+
+    def _wrong_registers(self, chip: I2CChip) -> list[str]:
+        mode1, mode2 = chip.read(MODE1, 2)
+        prescale = chip.read(PRE_SCALE, 1)[0]
+        if mode1 & SLEEP:
+            return ["the chip sleeps, as after a restart, and sends no pulses"]
+        registers = (
+            ("MODE1", mode1 & (EXTCLK | AUTO_INCREMENT), AUTO_INCREMENT),
+            ("MODE2", mode2 & _MODE2_USED, OUTDRV),
+            ("PRE_SCALE", prescale, prescale_of(self._settings.frequency_hz)),
+        )
+        return [
+            f"register {name} holds {found}, expected {expected}"
+            for name, found, expected in registers
+            if found != expected
+        ]

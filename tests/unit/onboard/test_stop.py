@@ -64,7 +64,7 @@ def car(tmp_path):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(neutral, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(neutral, "PATIENCE_S", 0.6)
 
 
 def drive(bus):
@@ -147,7 +147,7 @@ def test_a_mistyped_name_is_told_what_drives(car):
     drive = subprocess.Popen(words, stdout=subprocess.PIPE)
     try:
         drive.stdout.readline()
-        with pytest.raises(ConfigError, match=rf"cra\.yaml.*process {drive.pid} ") as caught:
+        with pytest.raises(ConfigError, match=rf"(?s)cra\.yaml.*process {drive.pid} ") as caught:
             stop.stop_car(car.with_name("cra.yaml"))
         assert "drives" in str(caught.value) and drive.poll() is None
     finally:
