@@ -32,6 +32,7 @@ __all__ = [
     "meant_instead",
     "open_drive",
     "read_truth",
+    "refuse_foreign",
 ]
 
 #: Folders deep in which drives are looked for, and how many are named. Chosen: a Donkeycar's folder holds its
@@ -56,8 +57,19 @@ def open_drive(path: Path) -> Drive:
         raise DriveFormatError(f"{path}: no such drive{meant_instead(path)}")
     found = find_format(path)
     if found is None:
+        refuse_foreign(path)
         raise DriveFormatError(f"{path}: not a drive: expected {formats_text()}{meant_instead(path)}")
     return assemble_drive(path, found.read(path))
+
+
+def refuse_foreign(path: Path) -> None:
+    """Refuse a file of another kind, if it is known what makes a drive of it.
+
+    Raises:
+        DriveFormatError: Says what it is, and the command.
+    """
+    if not is_folder(path) and (step := next_step(path)) is not None:
+        raise DriveFormatError(f"{path}: is {step}")
 
 
 def meant_instead(path: Path) -> str:

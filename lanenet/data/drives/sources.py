@@ -20,6 +20,7 @@ from lanenet.data.drives import (
     is_photo,
     meant_instead,
     open_drive,
+    refuse_foreign,
 )
 from lanenet.data.drives.tub import is_old
 from lanenet.errors import CalibrationError, ConfigError, DriveFormatError
@@ -103,6 +104,7 @@ def open_source(path: Path) -> Source:
     photos = [photo for photo in photos if is_photo(photo)]
     # Images of a recording are none: they have times, commands and an order.
     if not photos or is_old(path):
+        refuse_foreign(path)
         raise DriveFormatError(
             f"{path}: expected {formats_text()}, or photos ({', '.join(PHOTO_ENDINGS)}), found none of them"
             f"{meant_instead(path)}"

@@ -12,7 +12,7 @@ from lanenet.data.tables import is_answers
 from lanenet.errors import DriveFormatError
 from lanenet.reading import is_regular
 
-VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
+VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".mjpg")
 
 #: Where the file has neither times nor a rate: that of a Donkeycar.
 _DEFAULT_FPS = 20.0
