@@ -6,7 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import sampled_checks
 from hypothesis import settings
+
+sampled_checks.install()
 
 # Machines of a test farm are busy: a slow example is no failure, and a red run must be red again.
 settings.register_profile("project", deadline=None, derandomize=True)

@@ -43,8 +43,12 @@ NOT_RUN = {
     r"lanenet calibrate drive": "needs two laps; run in tests/sim/test_calibrate_drive.py",
     r"lanenet .*--rerun live": "opens a viewer's window",
 }
-#: What stands in ``slow`` takes longer than the gate has time for; the chain trains by `train` in the gate.
-SLOW = r"lanenet (train|sweep|judge|reality|val .*--robust|sheets \w+)\b"
+#: What stands in ``slow`` takes longer than the gate has time for, or another test does the same: the chain
+#: trains by `train` in the gate, tests/unit/fleet runs `label-all`, other lines map, export and compare.
+SLOW = (
+    r"lanenet (train|sweep|judge|reality|sheets \w+|label-all|map runs/drive7"
+    r"|export .*--out|val .*--(robust|all))\b"
+)
 #: A file's time may be that of the clock's last tick. Chosen: ten ticks of a slow one.
 CLOCK_STEP_NS = 10**8
 #: What makes a command small.
