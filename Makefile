@@ -47,8 +47,8 @@ help:
 	@echo "make pictures     the moving picture of the README, from a recorded drive (DRIVE, LANE_WIDTH, SHOWN)"
 	@echo "make release      source archive and wheel of this version into dist/ (needs g++)"
 	@echo "make wheels       wheels for x86-64 and 64-bit Arm into dist/ (needs g++ and g++-aarch64-linux-gnu)"
-	@echo "make neutral      how long the motor runs on when drive or guard are killed or stopped, or the bus is away"
-	@echo "make faults       outages of the bus, late and hanging cameras, wrong settings: a table in ten minutes"
+	@echo "make neutral      times of neutral on an emulated bus, for the tables of the documentation (touches no car; 40 min)"
+	@echo "make faults       outages of an emulated bus, late and hanging cameras, wrong settings: a table (10 min)"
 	@echo "make docs         the documentation as a site into site/; any broken link or warning fails it"
 	@echo "make figures      draw frames, windows and lengths anew, and the board to print, into docs/"
 	@echo "make links        ask for every address that the documents name (needs the network)"
@@ -228,6 +228,8 @@ $(VENV)/.stamp-train: pyproject.toml constraints.txt $(KERNELS) | $(BIN)/python
 # The developers' extra contains the other two.
 $(VENV)/.stamp-dev: pyproject.toml constraints.txt $(KERNELS) | $(BIN)/python
 	$(PIP) -e '.[dev]'
+	# Most of numba's loops are compiled once here, and not by each process of the tests at the same time.
+	$(BIN)/python -c "from datagen.compile_ahead import compile_ahead; compile_ahead().join()"
 	touch $(VENV)/.stamp-train $@
 
 $(BIN)/python:

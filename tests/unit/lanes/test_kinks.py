@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from datagen.lanes.kinks import with_kinks
 from datagen.lanes.offset import CubicBasis
@@ -79,7 +80,7 @@ def _off_cm(line: LaneLine, course_cm: np.ndarray) -> float:
     low, high = line.knots_cm[3] + 40.0, line.knots_cm[-4] - 40.0
     s_cm = np.arange(low, high if line.period_cm is None else high + 80.0, 0.5)
     course = _along(course_cm, np.arange(0.0, len(course_cm) * SIDE_CM, 0.1))
-    return float(max(np.hypot(*(course - at).T).min() for at in line.everywhere(line.with_corners(s_cm))))
+    return float(cKDTree(course).query(line.everywhere(line.with_corners(s_cm)))[0].max())
 
 
 @pytest.mark.parametrize("angle_deg", [30.0, 60.0, 90.0])
