@@ -27,7 +27,7 @@ NAMED_IMPORTS = {
     "datagen/fleet/storage.py": {"fsspec"},
     "lanenet/data/": {"pyarrow"},
     "lanenet/data/hub.py": {"huggingface_hub"},
-    "lanenet/data/drives/bag/": {"mcap", "rosbags"},
+    "lanenet/data/drives/bag/": {"lz4", "mcap", "rosbags", "zstandard"},
     "lanenet/learn/sweep.py": {"optuna"},
     "lanenet/onboard/actuators/": {"serial", "termios"},
     "lanenet/onboard/cameras/": {"picamera2"},

@@ -78,6 +78,12 @@ def copied(name: str) -> Callable[[Path], object]:
     return lambda folder: shutil.copy(ROOT / "configs" / name, folder / "file.yaml")
 
 
+def copied_car(folder: Path) -> None:
+    """A car's file, whose paths count from it."""
+    text = (ROOT / "configs" / "car" / "replay.yaml").read_text()
+    (folder / "file.yaml").write_text(text.replace("../../", f"{ROOT}/"))
+
+
 def settings(schema: Callable[[], type[Any]], name: str) -> Reader:
     return Reader(copied(name), lambda folder: load_settings(schema(), folder / "file.yaml"))
 
@@ -200,6 +206,9 @@ def make_video(folder: Path) -> None:
     (folder / "lap.csv").write_text("frame,t_s,throttle\n0,0.0,0.1\n1,0.05,0.2\n4,0.2,0.3\n")
 
 
+OPENCV_FILE = (ROOT / "tests/support/cases/camera_opencv_filestorage/opencv.yml").read_text()
+
+
 def make_ros(folder: Path) -> None:
     (folder / "info.yaml").write_text(ROS_FILE)
 
@@ -216,11 +225,15 @@ READERS: dict[str, Reader] = {
         lambda f: (f / "file.yaml").write_text(dump_settings(MapSettings())),
         lambda f: load_settings(MapSettings, f / "file.yaml"),
     ),
-    "car": Reader(copied("car/replay.yaml"), lambda f: load_drive_settings(f / "file.yaml"), anywhere=True),
+    "car": Reader(copied_car, lambda f: load_drive_settings(f / "file.yaml"), anywhere=True),
     "road": Reader(copied("tracks/town.yaml"), lambda f: load_track_settings(f / "file.yaml"), anywhere=True),
     "camera": Reader(
         lambda f: write_camera(f / "camera.yaml", make_camera(), "by hand"),
         lambda f: read_camera(f / "camera.yaml").intersect_ground(np.zeros((4, 2))),
+    ),
+    "opencv camera": Reader(
+        lambda f: (f / "lens.yml").write_text(OPENCV_FILE),
+        lambda f: read_lens(f / "lens.yml", Mounting(20.0), 26.0),
     ),
     "ros camera": Reader(make_ros, lambda f: read_lens(f / "info.yaml", Mounting(20.0), 26.0)),
     "folder": Reader(lambda f: write_drive(f / "drive", 3), lambda f: images(f / "drive")),

@@ -445,7 +445,9 @@ def check_model(
 ) -> tuple[onnxruntime.InferenceSession, ModelMeta]:
     """Do :func:`open_model` for what :func:`read_model` read."""
     session = new_session(data, where, threads, frames)
-    properties = session.get_modelmeta().custom_metadata_map
+    # Property texts that are no UTF-8.
+    with parsing(f"{where}: properties", ModelMismatchError):
+        properties = session.get_modelmeta().custom_metadata_map
     meta = ModelMeta.from_properties(properties, where)
     inputs = {i.name: (i.type, list(i.shape[1:])) for i in session.get_inputs()}
     shape = meta.planes, meta.window.rows, meta.window.columns
