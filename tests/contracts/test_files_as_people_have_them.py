@@ -30,6 +30,7 @@ from lanenet.calibration.chessboard import common_turn, read_picture
 from lanenet.cli.app import app
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.sources import open_source
+from lanenet.data.exports.pictures import Pictures
 from lanenet.errors import DriveFormatError
 
 CASES = Path(__file__).resolve().parents[1] / "support/cases"
@@ -632,6 +633,20 @@ def test_an_image_is_as_it_is_shown_whoever_reads_it(tmp_path: Path, ending: str
     # Of photos of a lens, all are turned as most of them are.
     assert common_turn([file, file]) == orientation
     assert read_picture(file, 1).shape == ((48, 64, 3) if orientation < 5 else (64, 48, 3))
+
+
+@pytest.mark.parametrize("orientation", [1, 3])
+def test_an_exported_picture_is_shown_alike_by_every_tool(tmp_path: Path, orientation: int) -> None:
+    """Some turn an image as its Exif data say, some do not; the labels are those of the turned one."""
+    (tmp_path / "images").mkdir()
+    turned_photo(tmp_path / "images" / "a.jpg", frame_image(5), orientation)
+    (tmp_path / "frames.csv").write_text("frame,file,t_s\n0,images/a.jpg,0\n")
+    pictures = object.__new__(Pictures)
+    pictures.drive = open_drive(tmp_path)
+    data, ending = pictures._file(0)
+    assert ending == (".jpg" if orientation == 1 else ".png")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), flags), pictures.drive.image(0))
 
 
 def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
