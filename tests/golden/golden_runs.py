@@ -130,10 +130,12 @@ def machine() -> dict[str, Any]:
 
 
 def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a CSV file as numbers, NaN where empty."""
+    """Columns of a CSV file as numbers, NaN where empty; without the marks of the images."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
+    return {
+        name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0] if name != "image"
+    }
 
 
 def load_results(name: str) -> Results:
