@@ -26,8 +26,8 @@ Polyline = Float[np.ndarray, "_ 2"]
 #: the polynomial u = a v^3 + b v^2 + c v + d, all in pixels. A parabola of the road is none of the image: the
 #: best one missed the bend of a road photo by up to 12 px near the horizon, a cubic by up to 5.
 LINE_PX_NAMES = ("near_u_px", "near_v_px", "far_u_px", "far_v_px", "a_px", "b_px", "c_px", "d_px")
-#: Rows of a line that its polynomial is fitted to, evenly over the image; evenly along the road most would lie
-#: near the horizon. Chosen: of a road in an image of 1080 rows, two or three rows apart.
+#: Rows of a line that its polynomial is fitted to, evenly over the image; evenly along the road most would
+#: lie near the horizon. Chosen: of a road in an image of 1080 rows, two or three rows apart.
 _ROWS = 241
 
 
