@@ -46,8 +46,8 @@ NOT_RUN = {
 #: What stands in ``slow`` takes longer than the gate has time for, or another test does the same: the chain
 #: trains by `train` in the gate, tests/unit/fleet runs `label-all`, other lines map, export and compare.
 SLOW = (
-    r"lanenet (train|sweep|judge|reality|sheets \w+|label-all|map runs/drive7"
-    r"|export .*--out|val .*--(robust|all))\b"
+    r"lanenet (train|sweep|judge|reality|sheets \w+|label-all|export .*--out|val .*--(robust|all)"
+    r"|map (runs/drive7|monday_tub|tuesday_tub|.*--tape-width))\b"
 )
 #: A file's time may be that of the clock's last tick. Chosen: ten ticks of a slow one.
 CLOCK_STEP_NS = 10**8
