@@ -25,8 +25,8 @@ _ROWS, _COLUMNS = 4, 8
 _LEAST_TEXTURE = 0.4
 #: The camera hangs if this share of the tiles that are proof repeat one earlier frame, and this many. At
 #: half, 30 of 13,020 frames of a standing camera were taken for repeats (160x120, denoised, JPEG quality 50);
-#: at this share none of 7,560, and every clock of up to 20 px is noticed at 160x120 without compression.
-_FROZEN_SHARE, _LEAST_TILES = 0.65, 8
+#: at this share none of 6,240, and every clock of up to 20 px is noticed at 160x120 without compression.
+_FROZEN_SHARE, _LEAST_TILES = 0.65, 6
 
 
 class FrameCheck:

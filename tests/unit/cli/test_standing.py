@@ -100,10 +100,10 @@ def test_what_is_damaged_hidden_or_part_of_something_is_no_drive(here: Path) -> 
 
 def test_a_clone_holds_no_drive_before_one_is_copied_into_it() -> None:
     repo = Path(__file__).resolve().parents[3]
-    shipped = [
-        path for name in ("checkpoints", "configs", "docs", "tests") for path in (repo / name).rglob("*")
-    ]
+    shipped = [path for name in ("checkpoints", "configs", "docs") for path in (repo / name).rglob("*")]
     assert [path for path in shipped if path.is_dir() and find_format(path) is not None] == []
+    # Those of the tests lie deeper than anybody looks for them.
+    assert not [path for path in look_around(repo).drives if (repo / "tests") in path.parents]
 
 
 def test_help_has_its_verbs_in_groups() -> None:

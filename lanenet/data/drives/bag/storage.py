@@ -101,7 +101,10 @@ def is_bag(path: Path) -> bool:
     if is_regular(path / METADATA_FILE):
         return bool(files)
     plain = [file for file in files if file.suffix in STORAGE_ENDINGS]
-    return bool(plain) and len({re.sub(r"_[0-9]+$", "", file.stem) for file in plain}) == 1
+    # A folder in which a bag lies beside folders is no bag itself.
+    if not plain or len({re.sub(r"_[0-9]+$", "", file.stem) for file in plain}) != 1:
+        return False
+    return not any(entry.is_dir() for entry in path.iterdir())
 
 
 def _storage_files(path: Path) -> tuple[list[Path], list[str]]:
