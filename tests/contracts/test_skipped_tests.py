@@ -30,7 +30,8 @@ def test_too_many_skips_fail_and_give_their_reasons(
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  data: of real drives\n")
     (tmp_path / "test_it.py").write_text(tests)
     # Nothing there: a path that is named but is no folder is as good as none.
-    environment = {**os.environ, "LANENET_SHARED_DATA": str(tmp_path / "nowhere")}
+    support = os.pathsep.join([str(CONFTEST.parent / "support"), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "LANENET_SHARED_DATA": str(tmp_path / "nowhere"), "PYTHONPATH": support}
     words = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", *options]
     ran = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == code, ran.stdout + ran.stderr
