@@ -28,6 +28,8 @@ PATIENCE_S = 15.0
 SENT_S = 0.5
 #: Between two attempts; a command takes a few milliseconds.
 AGAIN_S = 0.01
+#: An attempt is over within this time, unless its driver hangs.
+_JOIN_S = 0.1
 #: Neutral has to hold for this long at the end of a drive: another program that moves the car, as Donkeycar's
 #: loop does 20 times per second, has written again by then.
 HOLD_S = 0.25
@@ -101,7 +103,8 @@ def settle(
     patience_s = PATIENCE_S if patience_s is None else patience_s
     start_s = time.monotonic()
     counts, ignored, told = turn is None, 0, False
-    threading.Thread(target=repeat, name="neutral", daemon=True).start()
+    attempts = threading.Thread(target=repeat, name="neutral", daemon=True)
+    attempts.start()
     try:
         while True:
             fresh.wait(AGAIN_S)
@@ -130,6 +133,8 @@ def settle(
                 counts = agreed
     finally:
         over.set()
+        # The device is closed next; a driver that hangs is not waited for.
+        attempts.join(_JOIN_S)
 
 
 @runtime_checkable

@@ -63,6 +63,7 @@ class WireLog:
 
     def close(self) -> None:
         self._write("close")
+        self._is_open = False
         if self._unplugged:
             # As pyserial does; it is no OSError.
             raise termios.error(5, "Input/output error")
