@@ -135,7 +135,7 @@ def test_another_name_takes_the_finished_map(here: Path, first: str) -> None:
     result = train(str(whole), "--name", "third", "learn.epochs=1")
     assert result.exit_code == 0, result.output
     assert "has labels already, which are used" in result.stdout
-    assert "no video, since it has no frames" in result.stdout
+    assert "no video, since a label set holds no images" in result.stdout
     assert (here / "checkpoints" / "third" / "model.onnx").is_file()
 
 
