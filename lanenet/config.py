@@ -333,13 +333,13 @@ def _place(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[list
             continue
         keys.append(part)
         # The number of an entry of a list is no field.
-        models = [model for field in fields for model in _models_in(field)] if fields else models
+        models = [model for field in fields for model in models_in(field)] if fields else models
     return keys, models
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
     """Yield the schemas of a field's type: one, or several that the section's ``kind`` chooses from."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
-        yield from _models_in(part)
+        yield from models_in(part)

@@ -16,6 +16,8 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
+from lanenet.config import models_in
+
 #: One entry below ``Attributes:``, for one name or several.
 _ATTRIBUTE = r"^    (\w[\w, ]*): (.*?)(?=^    \w[\w, ]*: |^\S|\Z)"
 #: Units by the ends of keys, the longest first. Pixels and numbers without a unit need no word.
@@ -123,7 +125,7 @@ def sections(
         told.add(schema)
     settings, below = [], []
     for name, field in schema.model_fields.items():
-        nested = list(_nested(field.annotation))
+        nested = list(models_in(field.annotation))
         below += [(f"{key}.{name}" if key else name, each) for each in nested]
         default = "required" if field.is_required() else ""
         if not nested and field.default is not PydanticUndefined:
@@ -151,13 +153,6 @@ def _docstring(schema: type[BaseModel]) -> tuple[str, dict[str, str]]:
         for names, meaning in re.findall(_ATTRIBUTE, attributes, re.MULTILINE | re.DOTALL):
             meanings |= {name.strip(): _plain(meaning) for name in names.split(",")}
     return summary, meanings
-
-
-def _nested(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for part in get_args(annotation):
-        yield from _nested(part)
 
 
 def _kind(schema: type[BaseModel]) -> str:
