@@ -26,7 +26,6 @@ from lanenet.onboard.i2c import (
     I2CChip,
     describe_process,
     lock_owners,
-    parent_of,
     words_of,
 )
 from lanenet.onboard.neutral import AGAIN_S, HOLD_S, PATIENCE_S, Neutral, reach_neutral, settle, undisturbed
@@ -90,10 +89,10 @@ def stop_car(
     """
     told = _tell_drives(path)
     elsewhere = any(override.startswith("actuator") for override in overrides)
-    owner, guarded = ("", 0) if elsewhere else _tell_owner(path)
+    owner = "" if elsewhere else _tell_owner(path)
     try:
         with undisturbed():
-            done = _stop_actuator(path, overrides, guarded)
+            done = _stop_actuator(path, overrides)
     except LanenetError as error:
         if isinstance(error, MotorMayRunError):
             # Ending the drives takes longer.
@@ -140,11 +139,11 @@ def _tell_drives(path: Path) -> dict[int, str]:
     return drives
 
 
-def _tell_owner(path: Path) -> tuple[str, int]:
+def _tell_owner(path: Path) -> str:
     """Ask the owner of the file's device to end: it is in neutral before the settings are checked.
 
     Returns:
-        What it is, empty if there is none or it is not known yet; and the process that it guards, or 0.
+        What it is; empty if there is none, or it is not known yet.
     """
     import yaml
 
@@ -161,19 +160,11 @@ def _tell_owner(path: Path) -> tuple[str, int]:
             chip.open()
             pid = chip.owner()
             chip.close()
-        text, guarded = describe_process(pid), _guarded_by(pid)
+        text = describe_process(pid)
         if pid > 0 and pid != os.getpid():
             _tell(pid, signal.SIGTERM)
-            return text, guarded
-    return "", 0
-
-
-def _guarded_by(pid: int) -> int:
-    """Return the process of the drive whose guard a process is; 0 if it is none, or its drive is gone."""
-    if pid <= 0 or GUARD_MODULE not in words_of(pid):
-        return 0
-    parent = parent_of(pid)
-    return 0 if parent in (1, os.getpid()) else parent
+            return text
+    return ""
 
 
 def _children(pid: int) -> list[int]:
@@ -183,7 +174,7 @@ def _children(pid: int) -> list[int]:
         return []
 
 
-def _stop_actuator(path: Path, overrides: Sequence[str], guarded: int) -> list[str]:
+def _stop_actuator(path: Path, overrides: Sequence[str]) -> list[str]:
     """Bring the actuator of a car's file into neutral and end its owner; returns what was done."""
     from lanenet.onboard.actuators import make_actuator
     from lanenet.onboard.actuators.pca9685 import PCA9685
@@ -204,7 +195,7 @@ def _stop_actuator(path: Path, overrides: Sequence[str], guarded: int) -> list[s
                 return next((pid for pid in lock_owners(port.stat()) if pid != os.getpid()), 0)
             return 0
 
-        return _confirm(partial(_ask_board, actuator, owner), owner, guarded)
+        return _confirm(partial(_ask_board, actuator, owner), owner)
     if not isinstance(actuator, PCA9685):
         return [f"an actuator of kind {settings.kind} has no motor"]
     try:
@@ -212,7 +203,7 @@ def _stop_actuator(path: Path, overrides: Sequence[str], guarded: int) -> list[s
             actuator.attach()
         except HardwareError as error:
             raise MotorMayRunError(Neutral(False, str(error)).may_run) from None
-        return _confirm(actuator.neutral, actuator.owner, guarded)
+        return _confirm(actuator.neutral, actuator.owner)
     finally:
         actuator.release()
 
@@ -231,8 +222,10 @@ def _ask_board(board: SerialBoard, owner: Callable[[], int]) -> Neutral | None:
         board.close()
 
 
-def _confirm(neutral: Callable[[], Neutral | None], owner: Callable[[], int], guarded: int) -> list[str]:
-    """Repeat neutral until it is confirmed while nobody owns the device or takes over from its guard.
+def _confirm(neutral: Callable[[], Neutral | None], owner: Callable[[], int]) -> list[str]:
+    """Repeat neutral until it is confirmed while nobody owns the device.
+
+    A drive whose guard has ended writes nothing but neutral, and may be deaf: it is not waited for.
 
     Returns:
         What was done.
@@ -241,7 +234,7 @@ def _confirm(neutral: Callable[[], Neutral | None], owner: Callable[[], int], gu
         HardwareError: If the owner cannot be ended.
         MotorMayRunError: If neutral was not confirmed.
     """
-    ending = _Ending(owner, guarded=guarded)
+    ending = _Ending(owner)
     left = settle(neutral, ending.turn, hold_s=HOLD_S) or Neutral(False, "the device is not open")
     if left.confirmed is False:
         raise MotorMayRunError(left.may_run)
@@ -256,12 +249,10 @@ class _Ending:
         forced: Whether one of them had to be killed.
     """
 
-    def __init__(self, owner: Callable[[], int], patience_s: float = _END_S, guarded: int = 0) -> None:
+    def __init__(self, owner: Callable[[], int], patience_s: float = _END_S) -> None:
         self.ended: list[str] = []
         self.forced = False
         self._owner, self._patience_s = owner, patience_s
-        #: The drive, which takes over from its guard and says itself what became of neutral.
-        self._guarded = guarded, describe_process(guarded)
         self._pid, self._text, self._since_s = 0, "", 0.0
         self._signals = [signal.SIGKILL, signal.SIGTERM]
 
@@ -276,11 +267,9 @@ class _Ending:
             if self._pid:
                 self.ended.append(self._text)
             self._pid, self._text, self._since_s = pid, describe_process(pid), -1.0
-            if guarded := _guarded_by(pid):
-                self._guarded = guarded, describe_process(guarded)
             self._signals = [signal.SIGKILL, signal.SIGTERM]
         if not pid:
-            return not _runs(*self._guarded)
+            return True
         if pid < 0:
             raise MotorMayRunError(
                 f"{self._text} still drives, which cannot be seen from here; disconnect the battery"

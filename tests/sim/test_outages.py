@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -47,23 +48,55 @@ def test_a_bus_that_stays_away_is_said_and_has_a_code(fault: str, manner: str, t
     assert not result.wrong, f"{result.wrong}\n{result.said}"
 
 
-def test_a_drive_that_closes_slowly_is_still_stopped_on_purpose(tmp_path: Path) -> None:
-    # A second signal, of whoever stops it, is no impatience.
-    (tmp_path / "car.yaml").write_text("actuator: {kind: pca9685}\n")
+def start_drive(changes: str, folder: Path) -> subprocess.Popen[bytes]:
+    """Start the smallest drive with another camera; its command line is that of a drive by a car's file."""
+    (folder / "car.yaml").write_text("actuator: {kind: pca9685}\n")
     code = (
-        "import sys, time, neutral_times; neutral_times.Camera.close = lambda _: time.sleep(1.5); "
+        f"import signal, sys, time, neutral_times\n{changes}\n"
         'sys.exit(neutral_times.main(\'{"kind": "pca9685"}\'))'
     )
-    environment = environment_of(tmp_path)
+    environment = environment_of(folder)
     environment["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
-    words = [sys.executable, "-c", code, "lanenet", "drive", str(tmp_path / "car.yaml")]
-    drive = subprocess.Popen(words, env=environment, stderr=subprocess.PIPE)
+    words = [sys.executable, "-c", code, "lanenet", "drive", str(folder / "car.yaml")]
+    return subprocess.Popen(words, env=environment, stderr=subprocess.PIPE)
+
+
+def stop(folder: Path) -> subprocess.CompletedProcess[str]:
+    Wire(folder).wait(driving=True, after_s=0.0)
+    words = [sys.executable, "-m", "lanenet", "stop", str(folder / "car.yaml")]
+    return subprocess.run(words, env=environment_of(folder), capture_output=True, text=True, timeout=60)
+
+
+def test_a_drive_that_closes_slowly_is_still_stopped_on_purpose(tmp_path: Path) -> None:
+    # A second signal, of whoever stops it, is no impatience.
+    drive = start_drive("neutral_times.Camera.close = lambda _: time.sleep(1.5)", tmp_path)
     try:
-        Wire(tmp_path).wait(driving=True, after_s=0.0)
-        stop = [sys.executable, "-m", "lanenet", "stop", str(tmp_path / "car.yaml")]
-        done = subprocess.run(stop, env=environment, capture_output=True, text=True, check=True, timeout=30)
+        done = stop(tmp_path)
         assert done.stdout.splitlines()[0] == "neutral" and f"ended process {drive.pid}" in done.stdout
         assert drive.wait(5.0) == 0
+    finally:
+        drive.kill()
+        drive.communicate()
+
+
+@pytest.mark.slow
+def test_a_drive_that_never_ends_does_not_make_neutral_doubtful(tmp_path: Path) -> None:
+    # Its detector hangs, deaf to signals; the guard holds neutral, and ends when it is told to.
+    deaf = """
+see, seen = neutral_times.Eye.detect, []
+def detect(*words):
+    seen.append(words)
+    if len(seen) > 20:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+        time.sleep(60.0)
+    return see(*words)
+neutral_times.Eye.detect = detect
+"""
+    drive = start_drive(deaf, tmp_path)
+    try:
+        done = stop(tmp_path)
+        assert done.stdout.splitlines()[0] == "neutral" and f"killed process {drive.pid}" in done.stdout
+        assert done.returncode == 0 and drive.wait(5.0) == -signal.SIGKILL
     finally:
         drive.kill()
         drive.communicate()

@@ -13,7 +13,7 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from lanenet.cli.app import app
-from lanenet.config import _models_in
+from lanenet.config import models_in
 from lanenet.data.drives import open_drive
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.errors import CalibrationError, ConfigError
@@ -65,7 +65,7 @@ def path_fields(schema: Any, prefix: str = "") -> Iterator[tuple[str, str | None
     for name, field in schema.model_fields.items():
         if Path in (field.annotation, *get_args(field.annotation)):
             yield f"{prefix}{name}", None if field.is_required() or not field.default else str(field.default)
-        for nested in _models_in(field.annotation):
+        for nested in models_in(field.annotation):
             yield from path_fields(nested, f"{prefix}{name}.")
 
 
