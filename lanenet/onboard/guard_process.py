@@ -368,14 +368,21 @@ def main(arguments: list[str], build: Callable[[str], Actuator] = actuator_from_
 
 def _leave(actuator: Actuator, pulse: int) -> Neutral | None:
     """Bring the actuator into neutral and release it; one that hangs is released with the process."""
+    attempt: Callable[[], Neutral | None] = actuator.neutral
+
+    def neutral() -> Neutral | None:
+        nonlocal attempt
+        left = attempt()
+        # A board whose plug slipped is opened again; one that could not be opened at all is left alone.
+        attempt = partial(reach_neutral, actuator)
+        return left
 
     def turn() -> bool:
         beat(pulse)
         return True
 
-    # A board whose plug slipped is opened again; one that could not be opened at all is left alone.
-    reached = actuator.neutral() is not None
-    left = settle(partial(reach_neutral, actuator), turn, hold_s=HOLD_S) if reached else None
+    # The first attempt may hang as well.
+    left = settle(neutral, turn, hold_s=HOLD_S)
     if left is None or left.confirmed is not False:
         _close(actuator)
     return left

@@ -124,7 +124,11 @@ def settle(
                 return doubt if counts else Neutral(False, "what drives has not ended")
             if not told and passed_s >= SENT_S and answer is not None and not unreadable:
                 told = True
-                text = doubt.may_run if counts else "neutral is sent until what drives has ended"
+                text = (
+                    doubt.may_run
+                    if counts
+                    else "a command or a drive has not ended yet; neutral is sent meanwhile"
+                )
                 log.warning("%s; tried for %g s", text, patience_s)
             if turn is not None:
                 if (agreed := turn()) and not counts:

@@ -124,7 +124,8 @@ def run(case: Case, folder: Path) -> Result:
         last = ended if ended is not None else process
         code = None if drives_on else _code(last, 3.0)
         late_s = math.inf if runs else stopped_s - after_s
-        return _judge(case, drives_on, late_s, code, log, early or _claim(log, before, wire, begin_s))
+        claim = early or _claim(log, before, wire, begin_s, resumes=drives_on)
+        return _judge(case, drives_on, late_s, code, log, claim)
     finally:
         for pid in (process.pid, guard):
             if pid:
@@ -157,11 +158,16 @@ def _strike(
         return subprocess.Popen(words, env=environment, stdout=stream, stderr=stream)
 
 
-def _claim(log: Path, before: int, wire: Wire, since_s: float) -> str:
-    """Return the line that says neutral, without an addition, while the motor runs; empty if none does."""
+def _claim(log: Path, before: int, wire: Wire, since_s: float, resumes: bool = False) -> str:
+    """Return the line that says neutral, without an addition, while the motor runs; empty if none does.
+
+    A car that drives on may have been in neutral meanwhile.
+    """
     said = log.read_bytes()[before:].decode(errors="replace")
     lines = [line for line in said.splitlines() if _CLAIM.match(line)]
-    runs = wire.motor()[-1][1] or not [w for w in wire.throttles(driving=False) if w.t_s >= since_s]
+    runs = (wire.motor()[-1][1] and not resumes) or not [
+        w for w in wire.throttles(driving=False) if w.t_s >= since_s
+    ]
     return lines[0] if lines and runs else ""
 
 
