@@ -49,7 +49,7 @@ def drive_files(source: str) -> dict[str, str]:
         found = {file: system.info(file) for file in [path, *filter(system.exists, dict.fromkeys(beside))]}
     found = {name: info for name, info in found.items() if info["type"] == "file"}
     if not found:
-        raise DriveFormatError(f"{source}: holds no file, expected a drive")
+        raise DriveFormatError(f"{source}: holds no file that can be read, expected a drive")
     return {
         name: json.dumps([info["size"], str(info.get("ETag") or info.get("mtime") or info.get("created"))])
         for name, info in sorted(found.items())

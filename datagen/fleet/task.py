@@ -40,7 +40,8 @@ class FleetDrive:
         name: Unique in a run; the drive's name in its label set.
         source: Path or URL, the same on every machine.
         checksum: Of its files, see :func:`datagen.fleet.source.checksum`.
-        lane_width_cm: Distance between the middles of the two lines of the driven lane.
+        lane_width_cm: Distance between the middles of the two lines of the driven lane; None if only the
+            drive could say it, and cannot be read.
         camera: Camera file or an earlier map, the same path on every machine; None for the drive's own.
         wheelbase_cm: Distance between the axles; None if unknown.
         camera_height_cm: Height of the lens above the road; None if unknown.
@@ -53,7 +54,7 @@ class FleetDrive:
     name: str
     source: str
     checksum: str
-    lane_width_cm: float
+    lane_width_cm: float | None
     camera: str | None = None
     wheelbase_cm: float | None = None
     camera_height_cm: float | None = None

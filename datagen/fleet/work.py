@@ -155,6 +155,8 @@ def _map_with(job: Job, path: Path, folder: Path, camera: Path | None) -> dict[s
     meter, found = Meter(), {"verdict": REFUSED, "reason": "", "reasons": [], "frames": 0, "driven_s": 0.0}
     try:
         recording = open_drive(path)
+        if drive.lane_width_cm is None:
+            raise LanenetError(f"{drive.source}: could not be read when the run began")
         found |= {"frames": len(recording), "driven_s": round(driven_s(recording), 3)}
         found |= {"width": recording.width, "height": recording.height}
         request = MapRequest(

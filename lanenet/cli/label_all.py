@@ -238,13 +238,16 @@ class Told(NamedTuple):
     ) -> FleetDrive:
         """Return a drive that says so much of itself; None for what it does not say.
 
+        One that cannot be read may lack its lane width: it fails, and the others are done.
+
         Raises:
             ConfigError: If its lane width is not known.
         """
         from datagen.fleet.task import FleetDrive
 
-        width_cm = lane_width_cm or _own_width_cm(source) or self.lane_width_cm
-        if width_cm is None:
+        own_cm, readable = (None, True) if lane_width_cm else _own_width_cm(source)
+        width_cm = lane_width_cm or own_cm or self.lane_width_cm
+        if width_cm is None and readable:
             raise ConfigError(
                 f"{source}: expected --lane-width: the distance in cm between the middles of the lane's two "
                 "lines"
@@ -285,14 +288,14 @@ def drives_of_library(file: Path, told: Told) -> list[FleetDrive]:
     return drives
 
 
-def _own_width_cm(source: str) -> float | None:
-    """Return the lane width that a drive on this machine knows by itself."""
+def _own_width_cm(source: str) -> tuple[float | None, bool]:
+    """Return the lane width that a drive on this machine knows by itself, and whether it can be read."""
     if "://" in source:
-        return None
+        return None, True
     try:
-        return open_drive(Path(source)).lane_width_cm
-    except (LanenetError, OSError):  # it will be refused, and the others done
-        return None
+        return open_drive(Path(source)).lane_width_cm, True
+    except (LanenetError, OSError):
+        return None, False
 
 
 def found_in(source: str) -> list[str]:

@@ -5,6 +5,7 @@ Imports ``datagen`` and ``lanenet.learn`` inside the functions, since the car ha
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +15,7 @@ from typing import Any
 from lanenet.config import apply_overrides, read_yaml
 from lanenet.data.drives import find_format, formats_text, meant_instead, open_drive
 from lanenet.errors import ConfigError, DriveFormatError, LanenetError
+from lanenet.reading import is_folder, is_regular, natural_key
 
 #: Steps of the training, and samples of each. From configs/finetune.yaml, whose 60 epochs on the early laps
 #: of garage_tape are 1,600 steps.
@@ -144,6 +146,8 @@ def epochs_of(frames: int) -> int:
 def sources_in(path: Path) -> list[Path]:
     """Return what a path names: a drive, a map, a label set; or the drives and maps that a folder holds.
 
+    A folder in it that cannot be looked into counts as a drive, which its reader refuses.
+
     Raises:
         DriveFormatError: If it is none of these.
     """
@@ -151,7 +155,8 @@ def sources_in(path: Path) -> list[Path]:
         raise DriveFormatError(f"{path}: no such drive, map, label set or config{meant_instead(path)}")
     if _is_source(path):
         return [path]
-    inside = [each for each in sorted(path.iterdir()) if _is_source(each)] if path.is_dir() else []
+    entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else []
+    inside = [each for each in entries if _is_closed(each) or _is_source(each)]
     inside = [each for each in inside if each.suffix != ".parquet"]
     if not inside:
         raise DriveFormatError(
@@ -167,7 +172,11 @@ def _is_source(path: Path) -> bool:
 
 def _is_finished(path: Path) -> bool:
     """Tell whether a path is a map or a label set."""
-    return (path / "map.yaml").is_file() or (path.suffix == ".parquet" and path.is_file())
+    return is_regular(path / "map.yaml") or (path.suffix == ".parquet" and is_regular(path))
+
+
+def _is_closed(path: Path) -> bool:
+    return is_folder(path) and not os.access(path, os.R_OK | os.X_OK)
 
 
 def _recording(path: Path, measured: Measured, folder: Path, runs: Path) -> tuple[dict[str, Any], int]:

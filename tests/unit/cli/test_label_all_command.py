@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from drives import write_drive
+from drives import record, write_drive, write_tub
 from fleet_work import HereEngine
 from small_map import CAMERA
 from typer.testing import CliRunner
@@ -16,6 +19,7 @@ from datagen.fleet import work
 from datagen.fleet.local_engine import LocalEngine
 from datagen.fleet.ray_engine import RayEngine
 from datagen.fleet.result import CarFound, FleetResult, TrackFound
+from datagen.fleet.source import checksum
 from datagen.fleet.task import FleetDrive
 from lanenet.cli.app import app
 from lanenet.cli.label_all import (
@@ -70,6 +74,54 @@ def test_a_failed_drive_gives_code_1_and_its_reason(tmp_path: Path, faults: None
     assert re.search(
         r"error: 1 drive failed, the first: ZeroDivisionError: by zero; run .* again", found.output
     )
+
+
+def test_a_folder_that_is_closed_fails_alone(tmp_path: Path, faults: None, monkeypatch: pytest.MonkeyPatch):
+    for number, name in enumerate(("tub_10", "tub_2", "closed")):
+        write_drive(tmp_path / "drives" / name, n=5 + number)
+    closed, stat = tmp_path / "drives" / "closed", Path.stat
+
+    def answer(path: Path, **options: bool) -> os.stat_result:
+        if closed in path.parents:
+            raise PermissionError(f"Permission denied: '{path}'")
+        return stat(path, **options)
+
+    # Instead of chmod, which does not keep out root.
+    monkeypatch.setattr(Path, "stat", answer)
+    monkeypatch.setattr(os, "access", lambda path, mode, **_: Path(path) != closed)
+    # 2 comes before 10.
+    assert [Path(each).name for each in found_in(str(closed.parent))] == ["closed", "tub_2", "tub_10"]
+    monkeypatch.setattr("datagen.fleet.checksums.checksum", no_checksum(closed))
+    monkeypatch.setattr("datagen.fleet.stage.checksum", no_checksum(closed))
+    for width in ((), ("--lane-width", "40")):
+        found = invoke(closed.parent, "--out", tmp_path / "out", *width)
+        assert found.exit_code == 1 and "2 refused, 1 failed" in found.output, found.output
+
+
+def no_checksum(closed: Path) -> Callable[[str], str]:
+    def answer(source: str) -> str:
+        if source == str(closed):
+            raise PermissionError(f"Permission denied: '{source}'")
+        return checksum(source)
+
+    return answer
+
+
+def test_without_a_lane_width_a_drive_that_cannot_be_read_fails_alone(tmp_path: Path, faults: None):
+    write_drive(tmp_path / "drives" / "a")
+    bad = write_drive(tmp_path / "drives" / "b", n=6)
+    (bad / "drive.yaml").write_bytes("format: lanenet-drive/1\nnotes: Straße\n".encode("latin-1"))
+    found = invoke(tmp_path / "drives", "--out", tmp_path / "out")
+    assert found.exit_code == 0 and "2 refused, 0 failed" in found.output, found.output
+    reasons = {
+        each["name"]: each["reason"]
+        for each in json.loads((tmp_path / "out" / "drives.json").read_text())["drives"]
+    }
+    assert reasons["a"] == "the car stands still" and "cannot be read as text" in reasons["b"]
+    # One that can be read is to say its width, or the command.
+    write_tub(tmp_path / "tub", [record(k) for k in range(5)])
+    found = invoke(tmp_path / "drives", tmp_path / "tub", "--out", tmp_path / "out")
+    assert found.exit_code == 1 and "tub: expected --lane-width" in found.output
 
 
 def test_files_of_others_stay_also_behind_links(tmp_path: Path, faults: None):

@@ -106,20 +106,23 @@ def test_few_frames_are_shown_more_often() -> None:
 
 
 def test_a_folder_stands_for_the_drives_and_maps_in_it(here: Path) -> None:
-    for name in ("b", "a"):
+    for name in ("lap_10", "lap_2"):
         write_drive(here / "data" / name, 2)
     mapped(here / "data" / "map")
     write_labels(here / "data" / "labels.parquet", make_label_set(2, 0))
-    assert sources_in(Path("data")) == [Path("data/a"), Path("data/b"), Path("data/map")]
+    # In the order in which people count.
+    assert sources_in(Path("data")) == [Path("data/lap_2"), Path("data/lap_10"), Path("data/map")]
     assert sources_in(Path("data/labels.parquet")) == [Path("data/labels.parquet")]
     with pytest.raises(DriveFormatError, match="no such drive, map, label set or config"):
         sources_in(Path("dat"))
     (here / "mycar").mkdir()
     shutil.move(here / "data", here / "mycar" / "data")
-    with pytest.raises(DriveFormatError, match="there are drives in it: type mycar/data/a, mycar/data/b"):
+    with pytest.raises(
+        DriveFormatError, match="there are drives in it: type mycar/data/lap_2, mycar/data/lap_10"
+    ):
         sources_in(Path("mycar"))
-    with pytest.raises(DriveFormatError, match="the folder above it: type mycar/data/a"):
-        sources_in(Path("mycar/data/a/images"))
+    with pytest.raises(DriveFormatError, match="the folder above it: type mycar/data/lap_10"):
+        sources_in(Path("mycar/data/lap_10/images"))
 
 
 def test_maps_and_label_sets_know_their_lane(here: Path) -> None:
