@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -48,12 +47,8 @@ def checksums_now(sources: Iterable[str], storage: Storage) -> dict[str, str]:
 
 def _known(storage: Storage) -> dict[str, list[str]]:
     """Return what stands for size and time of each drive's files, and their checksum."""
-    try:
-        known = json.loads(storage.read(CHECKSUMS_NAME) or b"{}")
-    except (ValueError, RecursionError):  # torn by a power cut: the files are read once more
-        return {}
-    pairs = known.items() if isinstance(known, dict) else ()
-    return {source: pair for source, pair in pairs if isinstance(pair, list) and len(pair) == 2}
+    known = storage.read_known(CHECKSUMS_NAME)
+    return {source: pair for source, pair in known.items() if isinstance(pair, list) and len(pair) == 2}
 
 
 def _pair(source: str, known: dict[str, list[str]]) -> list[str] | None:

@@ -25,7 +25,6 @@ from typing import Any
 from lanenet.data.files import require, write_bytes
 from lanenet.errors import LanenetError
 from lanenet.outputs import make_folder, remove, sync_path
-from lanenet.reading import parsing
 
 #: The marker of a finished result, and what is known of it.
 RESULT_NAME = "result.json"
@@ -90,20 +89,15 @@ class Storage:
     def result(self, kind: str, key: str) -> dict[str, Any] | None:
         """Return what the marker of a result says; None if it is not finished."""
         self._system.invalidate_cache()
-        return (
-            self.results(kind, [key])[key] if self._system.exists(self._at(kind, key, RESULT_NAME)) else None
-        )
+        there = self._system.exists(self._at(kind, key, RESULT_NAME))
+        return self.results(kind, [key]).get(key) if there else None
 
     def results(self, kind: str, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
-        """Return what the markers of finished results say.
-
-        Raises:
-            LanenetError: If a marker cannot be read.
-        """
+        """Return what the markers of finished results say; without those that a power cut tore."""
         paths = {self._at(kind, key, RESULT_NAME): key for key in keys}
         found = self._system.cat(list(paths)) if paths else {}
-        with parsing(self.url, LanenetError):
-            return {paths[path]: json.loads(data) for path, data in found.items()}
+        known = {paths[path]: _parsed(data) for path, data in found.items()}
+        return {key: marker for key, marker in known.items() if marker is not None}
 
     def read(self, *parts: str) -> bytes | None:
         """Return a file; None if it is not there."""
@@ -111,6 +105,10 @@ class Storage:
             return bytes(self._system.cat_file(self._at(*parts)))
         except FileNotFoundError:
             return None
+
+    def read_known(self, name: str) -> dict[str, Any]:
+        """Return what a JSON file beside the results says; nothing if it is not there, or torn."""
+        return _parsed(self.read(name) or b"{}") or {}
 
     def read_all(self, kind: str, keys: Iterable[str], name: str) -> dict[str, bytes]:
         """Return a file of each of several finished results, at once; those that lack it are left out."""
@@ -206,27 +204,28 @@ class Storage:
     def sweep(self, kind: str, also: Iterable[str] = ()) -> None:
         """Remove what lost workers left of results that they had begun. Only while nobody writes there.
 
-        What has another name than results have stays, and so do links, and all of a storage without a mark.
+        What has another name than results have stays, and so do links, what lies behind one, and all of a
+        storage without a mark.
 
         Args:
             kind: Of the results.
             also: Keys of finished results that are not wanted any more.
         """
-        if not (self._system.exists(self._at(kind)) and self.is_marked):
+        if self._is_link(kind) or not (self._system.exists(self._at(kind)) and self.is_marked):
             return
         names = {PurePosixPath(path).name for path in self._system.ls(self._at(kind), detail=False)}
         names = {name for name in names if _OWN.fullmatch(name) and not self._is_link(kind, name)}
         unwanted = names & set(also)
         for key in unwanted:
             self._system.rm(self._at(kind, key, RESULT_NAME))
-        for name in unwanted | (names - self.finished(kind)):
+        for name in names - self.results(kind, self.finished(kind) & names - unwanted).keys():
             if self.folder is not None:
                 remove(self.folder / kind / name)
             elif self._system.exists(self._at(kind, name)):  # the folder went with its files
                 self._system.rm(self._at(kind, name), recursive=True)
 
-    def _is_link(self, kind: str, name: str) -> bool:
-        return self.folder is not None and (self.folder / kind / name).is_symlink()
+    def _is_link(self, *parts: str) -> bool:
+        return self.folder is not None and self.folder.joinpath(*parts).is_symlink()
 
     def _upload(self, folder: Path, kind: str, key: str) -> None:
         """Write a result into an object store, its marker last.
@@ -242,6 +241,15 @@ class Storage:
 
     def _at(self, *parts: str) -> str:
         return "/".join([self._root.rstrip("/"), *parts])
+
+
+def _parsed(data: bytes) -> dict[str, Any] | None:
+    """Return what a JSON file says; None if it is torn, or holds something else."""
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _protocols(system: Any) -> tuple[str, ...]:

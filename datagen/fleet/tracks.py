@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -70,7 +69,7 @@ def recognised_tracks(
         The mapped drives of each track; and why maps could not be compared, which the next run does again.
     """
     mapped = [drive for drive in drives if drive.has_labels]
-    known: dict[str, str] = json.loads(storage.read(ALIKE_NAME) or b"{}")
+    known: dict[str, str] = storage.read_known(ALIKE_NAME)
     tasks, failed = list[Task](), list[str]()
     for place, drive in enumerate(mapped):
         before = [one for one in mapped[:place] if not (one.drive.track and drive.drive.track)]

@@ -149,6 +149,19 @@ def test_what_fails_or_is_refused_stops_nothing(tiny: Path, tmp_path: Path, mapp
     assert mapping == ["lost", "bug", "memory"]
 
 
+@pytest.mark.parametrize("kind", ["maps", "labels"])
+def test_a_result_whose_marker_is_torn_is_made_again_and_the_others_stay(
+    tiny: Path, tmp_path: Path, mapping: list[str], kind: str
+):
+    drives = drives_of(copy_of(tiny, tmp_path / "a"), copy_of(tiny, tmp_path / "b"))
+    result, _ = run(tmp_path / "out", drives)
+    keys = {"maps": result.drives[1].map_key, "labels": result.drives[1].labels_key}
+    (tmp_path / "out" / kind / keys[kind] / "result.json").write_text('{"verdict": "go')
+    again, names = run(tmp_path / "out", drives)
+    assert names == ["b"] and [drive.verdict for drive in again.drives] == ["good", "good"]
+    assert run(tmp_path / "out", drives)[1] == []
+
+
 def test_a_full_disk_ends_the_run_and_keeps_what_is_finished(tiny: Path, tmp_path: Path, mapping: list[str]):
     drives = drives_of(*(copy_of(tiny, tmp_path / "drives" / name) for name in ("a", "full", "z")))
     result, names = run(tmp_path / "out", drives)

@@ -163,12 +163,26 @@ def test_files_beside_the_results(storage: Storage):
     assert storage.read("drives.json") == b"two" and storage.finished("maps") == set()
 
 
-def test_a_damaged_marker_names_the_storage(storage: Storage):
-    fill(storage, "a")
+@pytest.mark.parametrize("torn", [b"", b'{"says": "da', b"\0" * 20, b"[" * 100_000, b"5"])
+def test_a_torn_marker_is_none(storage: Storage, torn: bytes):
+    storage.claim()
+    fill(storage, DONE)
+    fill(storage, OTHER)
     system, root = fsspec.core.url_to_fs(storage.url)
-    system.pipe_file(f"{root}/maps/a/{RESULT_NAME}", b"{")
-    with pytest.raises(LanenetError, match=storage.url.rpartition("/")[2]):
-        storage.result("maps", "a")
+    system.pipe_file(f"{root}/maps/{OTHER}/{RESULT_NAME}", torn)
+    assert storage.result("maps", OTHER) is None
+    assert storage.results("maps", [DONE, OTHER]) == {DONE: {"says": "data"}}
+    storage.sweep("maps")
+    assert storage.finished("maps") == {DONE} and not any(OTHER in file for file in files_of(storage))
+
+
+def test_sweeping_stays_out_of_a_kind_that_is_a_link(tmp_path: Path):
+    storage, far = Storage(str(tmp_path / "out")), tmp_path / "far"
+    storage.claim()
+    put(Storage(str(far)), f"{DONE}/data.txt", f".new-{BEGUN}-0123abcd/data.txt")
+    (tmp_path / "out" / "maps").symlink_to(far)
+    storage.sweep("maps", {DONE})
+    assert (far / DONE / "data.txt").exists() and (far / f".new-{BEGUN}-0123abcd" / "data.txt").exists()
 
 
 def test_urls(tmp_path: Path):

@@ -215,9 +215,13 @@ def test_tracks_without_a_name_are_recognised_and_no_pair_is_compared_twice(
         ("track of north", ("north", "north_too"))
     ]
     assert run(out, drives, find_tracks=True)[1] == [] and len(compared) == 6
+    # What a power cut tore is compared again.
+    (out / "alike.json").write_text('{"a b": "sa')
+    again, names = run(out, drives, find_tracks=True)
+    assert len(names) == 3 and len(compared) == 12 and again.tracks == result.tracks
     drives += on("", tiny, tmp_path, "unnamed")
     result, names = run(out, drives, find_tracks=True)
-    assert names == ["unnamed", "track of unnamed", "hall"] and len(compared) == 10
+    assert names == ["unnamed", "track of unnamed", "hall"] and len(compared) == 16
     assert {track.name: track.joined for track in result.tracks}["hall"] == ("a", "unnamed")
 
 
