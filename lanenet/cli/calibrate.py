@@ -16,6 +16,7 @@ from lanenet.cli.shared.options import (
     DriveArgument,
     MappingOption,
     WheelbaseOption,
+    check_beside,
     check_ending,
     check_not_source,
     lane_cm,
@@ -43,6 +44,8 @@ _Square = Annotated[float, typer.Option(parser=length_cm, metavar="CM", help="Si
 _AREA_CM = (-60.0, 0.0, 60.0, 120.0)
 #: Scale of bird's-eye pictures that stand side by side.
 _SMALL_PX_PER_CM = 4.0
+#: The pictures beside the camera file, of a lens and of a mounting.
+_LENS_PICTURES, _ROAD_PICTURES = ("undistorted", "board"), ("undistorted", "birdseye")
 _Out = Annotated[Path, typer.Option(help="Camera file to write (.yaml).")]
 
 
@@ -85,6 +88,7 @@ def chessboard(
     for path in (out, ros):
         if path is not None:
             check_ending(path, ".yaml", ".yml")
+    check_beside(out, *_pictures(out, *_LENS_PICTURES))
     lock_outputs(out, ros)
     wanted = parse_board(board, square)
     paths = list_pictures(images)
@@ -157,6 +161,7 @@ def ground(
     from lanenet.data.camera_file import write_camera
 
     check_ending(out, ".yaml", ".yml")
+    check_beside(out, *([] if image is None else _pictures(out, *_ROAD_PICTURES)))
     lock_outputs(out)
     lens = _read_lens(camera)
     if wheelbase is not None:
@@ -241,6 +246,7 @@ def drive_(
 
     check_ending(out, ".yaml", ".yml")
     check_not_source(drive, out)
+    check_beside(out, *_pictures(out, *_ROAD_PICTURES))
     lock_outputs(out)
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     start, notes = starting_camera(drive, camera, refine)
@@ -355,10 +361,10 @@ def _lens_pictures(out: Path, result: ChessboardCalibration, turn: int) -> list[
     (x0, y0), (x1, y1) = view.points_cm.min(axis=0), view.points_cm.max(axis=0)
     margin = 0.4 * max(x1 - x0, y1 - y0)
     area = (x0 - margin, y0 - margin, x1 + margin, y1 + margin)
-    return [
-        _write_picture(out, "undistorted", undistorting_view(result.camera).of(marked)),
-        _write_picture(out, "board", plane_picture(frame, result.camera, result.fit.poses[index], area)),
-    ]
+    above = plane_picture(frame, result.camera, result.fit.poses[index], area)
+    return _write_pictures(
+        _pictures(out, *_LENS_PICTURES), undistorting_view(result.camera).of(marked), above
+    )
 
 
 def _road_pictures(
@@ -372,19 +378,21 @@ def _road_pictures(
     pose = pose_from_mounting(camera.mounting)
     flat = [undistorting_view(camera).of(frame) for frame in marked]
     above = [plane_picture(frame, camera, pose, _AREA_CM, scale) for frame in frames]
-    return [
-        _write_picture(out, "undistorted", np.concatenate(flat, axis=1)),
-        _write_picture(out, "birdseye", np.concatenate(above, axis=1)),
-    ]
+    pictures = (np.concatenate(flat, axis=1), np.concatenate(above, axis=1))
+    return _write_pictures(_pictures(out, *_ROAD_PICTURES), *pictures)
 
 
-def _write_picture(out: Path, what: str, picture: np.ndarray) -> Path:
+def _pictures(out: Path, *names: str) -> list[Path]:
+    return [out.with_name(f"{out.stem}-{name}.png") for name in names]
+
+
+def _write_pictures(paths: list[Path], *pictures: np.ndarray) -> list[Path]:
     from lanenet.data.files import write_bytes
     from lanenet.data.tables import png_bytes
 
-    path = out.with_name(f"{out.stem}-{what}.png")
-    write_bytes(path, png_bytes(picture))
-    return path
+    for path, picture in zip(paths, pictures, strict=True):
+        write_bytes(path, png_bytes(picture))
+    return paths
 
 
 def _show_lens(result: ChessboardCalibration, pictures: int) -> None:

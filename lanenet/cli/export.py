@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lanenet.cli.shared import console
-from lanenet.cli.shared.options import check_ending, check_not_source, lock_outputs
+from lanenet.cli.shared.options import check_beside, check_ending, check_not_source, lock_outputs
 from lanenet.cli.shared.standing import next_on_car
 from lanenet.errors import ConfigError, counted
 
@@ -128,6 +128,8 @@ def _export_model(checkpoint: Path, out: Path | None, check: list[Path], int8: b
         check_ending(out, ".onnx")
     if int8 and check:
         raise ConfigError("--check: compares with PyTorch; it cannot be combined with --int8")
+    if int8 and out is not None:
+        check_beside(out, out.with_suffix(".json"))
     lock_outputs(out)
     if int8:
         from lanenet.learn.export import export_int8

@@ -13,6 +13,7 @@ from lanenet.cli.shared import console
 from lanenet.cli.shared.options import (
     AnyCameraOption,
     MarkingOption,
+    check_beside,
     check_not_source,
     lock_outputs,
     path_or_hub,
@@ -31,8 +32,11 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-#: Of files that --out may write, and that may be a source as well.
-_ENDINGS = (".html", ".json", ".md", ".png", "-worst.jpg")
+#: Ends of the names of the files that --out writes, the first of them always.
+_ENDINGS = (
+    *(".html", ".json", ".md", ".png", "-breakdown.png", "-worst.jpg", "-plain.jpg"),
+    *("-robust.md", "-robust.json"),
+)
 
 
 @app.command(epilog="Example: lanenet val checkpoints/small runs/drive7 runs/my_map --out runs/errors")
@@ -104,8 +108,10 @@ def val(
     model, source_paths = _split_paths(paths)
     more = _more_models(also or [])
     if out is not None:
+        page, *others = (Path(f"{out}{end}") for end in _ENDINGS)
         for source in source_paths:
-            check_not_source(source, *(Path(f"{out}{end}") for end in _ENDINGS))
+            check_not_source(source, page, *others)
+        check_beside(out, *others, first=page)
     lock_outputs(out)
     views.check(source_paths[0] if len(source_paths) == 1 else None)
     meta = None if model is None else read_model_meta(model)
@@ -140,8 +146,8 @@ def val(
     robustness = _robustness({"network": model, **more}, sources) if robust and model is not None else None
     if out is not None:
         judged = comparison.first if model is None else model.resolve().parent.name
-        page = model_page(f"How good {judged} is", comparison, seen, where)
-        files = {".html": page, ".json": json_text(comparison.as_dict()), **report_files(comparison, seen)}
+        html = model_page(f"How good {judged} is", comparison, seen, where)
+        files = {".html": html, ".json": json_text(comparison.as_dict()), **report_files(comparison, seen)}
         if robustness is not None:
             files |= {"-robust.md": robustness[0], "-robust.json": json_text(robustness[1])}
         for ending, content in files.items():

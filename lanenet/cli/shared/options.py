@@ -209,15 +209,20 @@ def check_not_source(source: Path, *outs: Path | None) -> None:
             raise ConfigError(f"{out}: {found}; choose another name: {out.with_stem(f'{out.stem}_out')}")
 
 
-def check_beside(out: Path, *others: Path) -> None:
+def check_beside(out: Path, *others: Path, first: Path | None = None) -> None:
     """Refuse to replace files that nobody named: those that a command writes beside its output.
 
     Files beside an output that is there are those of the last run.
 
+    Args:
+        out: The name that was given.
+        others: What is written beside it.
+        first: The output itself, if its name has an ending beyond the one that was given.
+
     Raises:
         ConfigError: Names the file.
     """
-    taken = [] if out.exists() else [path for path in others if path.exists()]
+    taken = [] if (first or out).exists() else [path for path in others if path.exists()]
     if taken:
         raise ConfigError(
             f"{taken[0]}: is there already, and would be replaced by what is written beside {out.name}; "

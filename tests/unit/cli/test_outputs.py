@@ -94,16 +94,32 @@ def test_the_video_of_answers_gets_another_name_than_its_source(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("verb", "out", "beside"), [("label", "a.parquet", "a.png"), ("localise", "a.csv", "a.tum")]
+    ("words", "out", "beside", "other"),
+    [
+        (["label", "{drive}"], "a.parquet", "a.png", "a_out.parquet"),
+        (["localise", "{drive}"], "a.csv", "a.tum", "a_out.csv"),
+        (["calibrate", "chessboard", "no.jpg", "--board", "9x6"], "a.yaml", "a-board.png", "a_out.yaml"),
+        (
+            ["calibrate", "ground", "--camera", "no", "--image", "no"],
+            "a.yaml",
+            "a-birdseye.png",
+            "a_out.yaml",
+        ),
+        (["calibrate", "drive", "{drive}"], "a.yaml", "a-undistorted.png", "a_out.yaml"),
+        (["val", "{drive}"], "a", "a.json", "a_out"),
+        (["val", "{drive}"], "a", "a-plain.jpg", "a_out"),
+        (["export", "{drive}", "--int8"], "a.onnx", "a.json", "a_out.onnx"),
+    ],
 )
-def test_what_nobody_named_is_not_replaced(tmp_path, verb, out, beside):
+def test_what_nobody_named_is_not_replaced(tmp_path, words, out, beside, other):
     drive = touched(tmp_path / "drive", "map.yaml")
     touched(tmp_path, beside)
-    line = refused(tmp_path, verb, drive, "--out", tmp_path / out)
-    assert f"{beside}: is there already" in line and f"a_out{Path(out).suffix}" in line
+    filled = [word.format(drive=drive) for word in words]
+    line = refused(tmp_path, *filled, "--out", tmp_path / out)
+    assert f"{beside}: is there already" in line and line.endswith(f"another name: {tmp_path / other}")
     # Of the last run.
-    touched(tmp_path, out)
-    assert "is there already" not in refused(tmp_path, verb, drive, "--out", tmp_path / out)
+    touched(tmp_path, "a.html" if out == "a" else out)
+    assert "is there already" not in refused(tmp_path, *filled, "--out", tmp_path / out)
 
 
 def test_endings(tmp_path):
