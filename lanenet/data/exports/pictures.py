@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lanenet.data.drives import Drive, open_drive
+from lanenet.data.drives.folder import TRUTH_FILE, read_truth
 from lanenet.data.drives.recording import ImageFiles
 from lanenet.data.label_set import LabelSet, read_labels
 from lanenet.data.maps.folder import DriveMap
@@ -25,7 +26,9 @@ from lanenet.reading import MAX_IMAGE, read_bytes
 _KEPT_ENDINGS = (".jpg", ".jpeg", ".png")
 #: Distance of the points of a line that are projected. Chosen: a pixel or two, on which a lens bends nothing.
 _STEP_CM = 0.25
-#: Poses of a label set and of its map differ by less. Chosen: by ten times what rounding takes from 100 m.
+_POSE_NAMES = ("x_cm", "y_cm", "heading_rad")
+#: Poses of a label set and of its map, or of the simulator's truth, differ by less. Chosen: by ten times what
+#: rounding takes from 100 m.
 _SAME_POSE_CM = 0.01
 
 
@@ -110,15 +113,17 @@ def open_pictures(path: Path, frames: Path) -> Pictures:
         frames: The map, or the simulated drive, that it was made from.
 
     Raises:
-        LabelFormatError: If it was not made from that drive with that camera.
+        LabelFormatError: If it was not made from that drive with that camera, or the drive was mapped or
+            simulated anew since.
         LanenetError: As :func:`open_mapped_drive` or :func:`open_drive`.
     """
     labels = read_labels(path)
-    drive_map = None
+    drive_map, poses = None, None
     if (frames / "map.yaml").is_file():
         mapped = open_mapped_drive(frames)
         drive, camera = mapped.drive, mapped.drive_map.camera
-        known, rows = mapped.drive_map.frames, mapped.rows
+        known, rows, poses = mapped.drive_map.frames, mapped.rows, mapped.drive_map.poses
+        anew = f"mapped anew since; make the labels again: lanenet label {frames} --out {path}"
     else:
         drive = open_drive(frames)
         if drive.camera is None:
@@ -126,6 +131,12 @@ def open_pictures(path: Path, frames: Path) -> Pictures:
                 f"{frames}: has no camera, expected the map, or the simulated drive, of {path}"
             )
         camera, known, rows = drive.camera, drive.frames, np.arange(len(drive))
+        truth = read_truth(frames) if labels.meta.source == "truth" else None
+        if truth is not None and not np.array_equal(truth["frame"], known):
+            raise DriveFormatError(f"{frames / TRUTH_FILE}: expected a row for each frame of the drive")
+        if truth is not None:
+            poses = np.stack([truth[name] for name in _POSE_NAMES], axis=1)
+        anew = "simulated anew since; make the labels again"
     if camera.hash != labels.meta.camera_hash or set(labels.drive) != {drive.name}:
         raise LabelFormatError(
             f"{path}: labels of {', '.join(sorted(set(labels.drive)))}, camera {labels.meta.camera_hash}; "
@@ -136,12 +147,11 @@ def open_pictures(path: Path, frames: Path) -> Pictures:
         raise LabelFormatError(f"{path}: frame {labels.frame[absent][0]} is not in {frames}")
     if (frames / "map.yaml").is_file():
         drive_map = (mapped.drive_map, found)
-        off_cm = np.abs(mapped.drive_map.poses[found] - labels.poses)[:, :2].max(initial=0.0)
-        if off_cm > _SAME_POSE_CM:
-            raise LabelFormatError(
-                f"{path}: its poses lie up to {off_cm:.2g} cm from those of {frames}, which was mapped anew "
-                f"since; make the labels again: lanenet label {frames} --out {path}"
-            )
+    off_cm = 0.0 if poses is None else np.abs(poses[found] - labels.poses)[:, :2].max(initial=0.0)
+    if off_cm > _SAME_POSE_CM:
+        raise LabelFormatError(
+            f"{path}: its poses lie up to {off_cm:.2g} cm from those of {frames}, which was {anew}"
+        )
     return Pictures(path, labels, drive, camera, rows[found], drive_map)
 
 

@@ -16,12 +16,13 @@ from small_map import CAMERA, small_map
 from synthetic_labels import make_label_set
 
 from lanenet.cli.export import FormatName
-from lanenet.data.camera_file import read_camera
+from lanenet.data.camera_file import read_camera, write_camera
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.exports import EXPORTS, export_labels
 from lanenet.data.label_set import LabelSet, read_labels, write_labels
 from lanenet.data.maps.folder import DriveMap, write_map
-from lanenet.errors import ConfigError, LabelFormatError, LanenetError
+from lanenet.data.tables import write_csv
+from lanenet.errors import ConfigError, DriveFormatError, LabelFormatError, LanenetError
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
 
 N = 6
@@ -208,6 +209,31 @@ def test_labels_of_another_camera_drive_or_frame_are_refused(
         write_labels(tmp_path / "b.parquet", changed)
         with pytest.raises(LabelFormatError, match=words):
             export_labels(tmp_path / "b.parquet", frames, "coco", tmp_path / "out")
+
+
+def test_labels_of_a_simulated_drive_that_was_made_anew_are_refused(
+    made: tuple[Path, Path, LabelSet, DriveMap], tmp_path: Path
+) -> None:
+    _, _, labels, _ = made
+    drive = tmp_path / "d"
+    write_camera(drive / "camera.yaml", CAMERA, "simulated")
+    (drive / "drive.yaml").write_text("format: lanenet-drive/1\ncamera: camera.yaml\n")
+    poses = dict(zip(labels.frame.tolist(), labels.poses, strict=True))
+
+    def simulate(off_cm: float) -> None:
+        xyh = np.array([poses.get(k, np.zeros(3)) + (off_cm, 0.0, 0.0) for k in range(N)])
+        columns = {"frame": np.arange(N), **dict(zip(("x_cm", "y_cm", "heading_rad"), xyh.T, strict=True))}
+        write_csv(drive / "truth.csv", columns | {name: np.ones(N) for name in POINT_NAMES})
+
+    write_labels(tmp_path / "b.parquet", replace(labels, meta=replace(labels.meta, source="truth")))
+    simulate(0.0)
+    assert export_labels(tmp_path / "b.parquet", drive, "coco", tmp_path / "out").frames == 5
+    simulate(2.0)
+    with pytest.raises(LabelFormatError, match=r"poses lie up to 2 cm from .*d, which was simulated anew"):
+        export_labels(tmp_path / "b.parquet", drive, "coco", tmp_path / "again")
+    (drive / "truth.csv").write_text((drive / "truth.csv").read_text().rstrip().rpartition("\n")[0] + "\n")
+    with pytest.raises(DriveFormatError, match=r"truth\.csv: expected a row for each frame"):
+        export_labels(tmp_path / "b.parquet", drive, "coco", tmp_path / "again")
 
 
 def test_the_command_knows_every_format() -> None:
