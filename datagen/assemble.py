@@ -62,6 +62,11 @@ class AssembledMap:
             near.append(seen[distances_seen(seen_car, camera.mounting.lead_cm) < reach_cm])
         return near
 
+    def asked_for_by(self, options: tuple[str, ...]) -> AssembledMap:
+        """Return the map with the options of ``lanenet map`` that asked for it, but for the lane width."""
+        meta = self.drive_map.meta.model_copy(update={"options": options})
+        return replace(self, drive_map=replace(self.drive_map, meta=meta))
+
     def scaled(self, factor: float, sigma: dict[str, float]) -> AssembledMap:
         """Return the map with every length multiplied by a factor, as if the lane were so much wider.
 

@@ -124,7 +124,8 @@ def _map_drive(
     found = None if like is None else rescaled(like, prepared)
     if found is None:
         found = _solve(attempt, prepared, solver)
-    assembled = found.assembled
+    config = () if attempt.settings == MapSettings() else ("--config", "CONFIG")
+    assembled = found.assembled.asked_for_by((*request.options, *config))
     solver.tell("lines and checks", 1, 2)
     checked = check_map(prepared, assembled, found.figures)
     solver.tell("lines and checks", 2, 2)

@@ -69,6 +69,20 @@ class MapRequest:
     tape_width_cm: float | None = None
     frames: tuple[int, int] | None = None
 
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Options of ``lanenet map`` that ask for this, but for the lane width."""
+        lengths = {
+            "--wheelbase": self.wheelbase_cm,
+            "--camera-height": self.camera_height_cm,
+            "--tape-width": self.tape_width_cm,
+        }
+        words = [] if self.camera_path is None else ["--camera", str(self.camera_path.resolve())]
+        words += ["--refine-camera"] * self.refine_camera
+        words += [word for name, cm in lengths.items() if cm is not None for word in (name, f"{cm:g}")]
+        words += [] if self.frames is None else ["--frames", f"{self.frames[0]}:{self.frames[1]}"]
+        return tuple(words)
+
     def open_drive(self) -> Drive:
         """Open the frames of the recording that are to be mapped.
 

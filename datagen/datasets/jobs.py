@@ -6,7 +6,6 @@ see :mod:`datagen.made`.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -375,13 +374,10 @@ class RecordedJob:
     def _check_width(self) -> None:
         meta, given_cm = read_map(self.frames).meta, self.recording.lane_width_cm
         mapped_cm = meta.lane_width_cm
-        again = shlex.join(
-            ["lanenet", "map", meta.drive, "--lane-width", f"{given_cm:g}", "--out", str(self.frames)]
-        )
         if abs(mapped_cm - given_cm) > _SAME_WIDTH * given_cm:
             raise ConfigError(
                 f"data.drives: {self.frames} is a map of a lane of {mapped_cm:g} cm, but lane_width_cm is "
-                f"{given_cm:g}; give the map's, or rescale it in seconds: {again}"
+                f"{given_cm:g}; give the map's, or {meta.width_command(self.frames, given_cm)}"
             )
 
 

@@ -132,9 +132,9 @@ def _rescale_instead(source: Path, measured: Measured) -> str:
     """Say how a finished map gets another lane width: the end of a sentence."""
     if measured.lane_width_cm is None or not (source / "map.yaml").is_file():
         return ""
-    drive, width_cm = read_yaml(source / "map.yaml").get("drive"), f"{measured.lane_width_cm:g}"
-    words = ["lanenet", "map", str(drive), "--lane-width", width_cm, "--out", str(source)]
-    return f"; to rescale it, which takes seconds: {shlex.join(words)}"
+    from lanenet.data.maps.folder import read_map_meta
+
+    return f"; to {read_map_meta(source).width_command(source, measured.lane_width_cm)}"
 
 
 def epochs_of(frames: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import shlex
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -73,6 +74,8 @@ class MapMeta(Settings):
         ahead_sigma_cm: Sigma of distances ahead of the car at the far label row, where the camera was found
             from the drive, see :func:`datagen.lanes.scale.ahead_sigma`; 0 for a given camera.
         verdict: How far the map can be trusted; None until it has been judged.
+        options: Options of ``lanenet map`` that asked for the map, but for the lane width; a config stands as
+            ``CONFIG``. None in a map of an earlier version.
     """
 
     format: str
@@ -85,6 +88,26 @@ class MapMeta(Settings):
     markings: Literal["light", "dark"] = "light"
     ahead_sigma_cm: float = Field(default=0.0, ge=0.0, le=MAX_PLACE)
     verdict: Literal["good", "usable", "reject"] | None = None
+    options: tuple[str, ...] | None = None
+
+    def command(self, folder: Path, lane_width_cm: float | None = None) -> str:
+        """Return the command that maps the drive again, or with another lane width.
+
+        Args:
+            folder: Of the map.
+            lane_width_cm: None for the map's own.
+        """
+        width_cm = self.lane_width_cm if lane_width_cm is None else lane_width_cm
+        words = ["lanenet", "map", self.drive, "--lane-width", f"{width_cm:g}", *(self.options or ())]
+        return shlex.join([*words, "--out", str(folder)])
+
+    def width_command(self, folder: Path, lane_width_cm: float) -> str:
+        """Say by which command the map gets another lane width, and what that does."""
+        # What the images show without its height is rescaled; else the lane width finds the focal length.
+        scales = self.options is not None and self.scale_from != "camera"
+        scales = scales and "--camera-height" not in (self.options or ())
+        how = "rescale it, which takes seconds" if scales else "map it anew"
+        return f"{how}: {self.command(folder, lane_width_cm)}"
 
     @property
     def lane_cm(self) -> float:

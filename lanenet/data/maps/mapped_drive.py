@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import logging
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
@@ -150,10 +149,7 @@ def check_images(mapped: MappedDrive, map_folder: Path, every: bool = False) -> 
         other, what = known & (by_s > _SAME_TIME_S), "times"
         other &= other.mean() > _MOST_OTHER_TIMES
     if other.any():
-        width_cm = f"{drive_map.meta.lane_width_cm:g}"
-        again = shlex.join(
-            ["lanenet", "map", str(drive.path), "--lane-width", width_cm, "--out", str(map_folder)]
-        )
+        again = drive_map.meta.model_copy(update={"drive": str(drive.path)}).command(map_folder)
         raise DriveFormatError(
             f"{drive.path}: of {len(other)} frames of {map_folder} the {what} of {int(other.sum())} are not "
             f"those that were mapped (first: frame {drive.frames[other][0]}): the drive was recorded anew or "

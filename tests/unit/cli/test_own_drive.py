@@ -243,7 +243,7 @@ def test_a_lane_unlike_those_that_the_network_knows_is_warned_of_at_once(here: P
 def test_the_lane_width_of_a_finished_map_is_corrected_by_map(here: Path) -> None:
     folder = mapped(here / "map")
     with pytest.raises(
-        ConfigError, match=r"is finished; to rescale it.*lanenet map .* --lane-width 41 --out"
+        ConfigError, match=r"is finished; to map it anew: lanenet map .* --lane-width 41 --out"
     ):
         config_of(folder, lane_width_cm=41.0)
     with pytest.raises(ConfigError, match=r"is finished$"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from small_map import small_map
+from typer.testing import CliRunner
 
 from datagen import pipeline
 from datagen.assemble import AssembledMap
@@ -22,6 +24,7 @@ from datagen.quality.figures import scaled_figures
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
+from lanenet.cli import app as cli
 from lanenet.data.maps.folder import read_map
 from lanenet.data.tables import ParquetTable
 from lanenet.errors import LanenetError
@@ -210,7 +213,7 @@ def test_every_length_of_a_map_is_scaled():
         drive_map, np.arange(n), LaneWidth(36.4, 38.0, (30.0, 40.0)), edges, drive_map.poses, [figures], 35.0
     )
     twice = assembled.scaled(2.0, {})
-    same_meta = {"format", "drive", "scale_from", "laps", "markings", "verdict", "ahead_sigma_cm"}
+    same_meta = {"format", "drive", "scale_from", "laps", "markings", "verdict", "ahead_sigma_cm", "options"}
     for name, value in drive_map.meta.model_dump().items():
         assert getattr(twice.drive_map.meta, name) == (value if name in same_meta else 2.0 * value), name
     assert twice.lane == LaneWidth(72.8, 76.0, (60.0, 80.0)) and twice.free_lane_cm == 70.0
@@ -243,3 +246,22 @@ def test_each_frame_has_its_near_points():
     edges = {"frame": frame, "segment": np.zeros(4, int), "x_cm": front[:, 0] + away_cm, "y_cm": front[:, 1]}
     one = AssembledMap(drive_map, np.arange(30), LaneWidth(36.0), edges, drive_map.poses, [])
     assert [len(points) for points in one.near_points[:4]] == [1, 0, 2, 0]
+
+
+def test_the_command_of_another_width_asks_for_the_same_map(drive: Path, tmp_path: Path):
+    request = MapRequest(drive, 40.0, wheelbase_cm=26.0, tape_width_cm=2.0, frames=(0, 65))
+    map_drive(request, MapSettings(), tmp_path / "map", pictures=False)
+    said = read_map(tmp_path / "map").meta.width_command(tmp_path / "map", 41.0)
+    assert said.startswith("rescale it, which takes seconds: lanenet map ")
+    result = CliRunner().invoke(cli.app, shlex.split(said.partition(": ")[2])[1:])
+    assert "was rescaled to 41 cm" in result.output.replace("\n", " ")
+    assert read_map(tmp_path / "map").camera.wheelbase_cm == 26.0
+
+
+@pytest.mark.parametrize(
+    "changes", [{"scale_from": "camera"}, {"options": ("--camera-height", "17")}, {"options": None}]
+)
+def test_a_map_that_cannot_be_rescaled_is_not_said_to_take_seconds(map_40: Path, changes: dict[str, Any]):
+    meta = read_map(map_40).meta.model_copy(update=changes)
+    assert "seconds" not in meta.width_command(map_40, 41.0)
+    assert "--lane-width 41" in meta.width_command(map_40, 41.0)
