@@ -294,8 +294,7 @@ def detect(
         mask: ``auto``, or a PNG that is black except on the car itself.
 
     Returns:
-        Counts, timings and problems; the table is read with
-        :func:`lanenet.data.detections.read_detections`.
+        Counts, timings and problems.
 
     Raises:
         LanenetError: If the source, the model or the camera cannot be used, or an output cannot be written.
