@@ -23,7 +23,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype -rs --fail-on-skips all \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train general install env test test-data real-drives test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-data test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then a network from nothing by $(CONFIG), into checkpoints/$(NAME)/"
@@ -44,7 +44,7 @@ help:
 	@echo "make golden-renew expect what they give now, and print what changed (on purpose only)"
 	@echo "make donkeycar    the pilot in donkeycar 5.3's own vehicle, driven from its own page (needs python3.11)"
 	@echo "make arm          the base installation on 64-bit Arm, emulated, against this machine (root, Debian)"
-	@echo "make pictures     the moving picture of the README, from a recorded drive (DRIVE, LANE_WIDTH, SHOWN)"
+	@echo "make pictures     the moving picture of the README, from a recorded drive (LANENET_SHARED_DATA or DRIVE, LANE_WIDTH, SHOWN)"
 	@echo "make release      source archive and wheel of this version into dist/ (needs g++)"
 	@echo "make wheels       wheels for x86-64 and 64-bit Arm into dist/ (needs g++ and g++-aarch64-linux-gnu)"
 	@echo "make neutral      times of neutral on an emulated bus, for the tables of the documentation (touches no car; 40 min)"
@@ -56,7 +56,7 @@ help:
 	@echo "make format       rewrite the code in the project's format"
 	@echo "make bench        time the stages that run on the car, on this machine"
 	@echo "make env          environment for developers in $(VENV)"
-	@echo "make clean        remove caches and intermediate files; keeps checkpoints/ and $(VENV)"
+	@echo "make clean        remove caches and what was built; keeps runs/, checkpoints/ and $(VENV)"
 
 train: $(VENV)/.stamp-train
 	$(BIN)/lanenet train $(CONFIG) name=$(NAME)
@@ -76,20 +76,14 @@ env: $(VENV)/.stamp-dev
 test: $(VENV)/.stamp-dev
 	$(PYTEST) -m "not slow"
 
-# Real drives are not part of the repository: their folder is named, or lies beside the checkout.
-REAL_DRIVES := $(or $(LANENET_SHARED_DATA),$(wildcard $(dir $(CURDIR))shared/data))
-NEED_REAL_DRIVES = @test -d "$(REAL_DRIVES)" || \
+# Real drives are not part of the repository: LANENET_SHARED_DATA names their folder.
+NEED_REAL_DRIVES = @test -d "$(LANENET_SHARED_DATA)" || \
   { echo "error: needs real drives, but LANENET_SHARED_DATA names no folder of them" >&2; exit 1; }
-
-test-slow golden golden-renew fleet: export LANENET_SHARED_DATA := $(REAL_DRIVES)
 
 # What Donkeycar is needed for has a target of its own.
 test-data: $(VENV)/.stamp-dev
-	$(if $(REAL_DRIVES),LANENET_SHARED_DATA=$(REAL_DRIVES) $(PYTEST) --fail-on-skips any -m "data and not slow" \
-	  --ignore tests/contracts/test_donkeycar.py,@echo "nothing tested: LANENET_SHARED_DATA names no folder of real drives")
-
-real-drives:
-	@echo $(REAL_DRIVES)
+	$(NEED_REAL_DRIVES)
+	$(PYTEST) --fail-on-skips any -m "data and not slow" --ignore tests/contracts/test_donkeycar.py
 
 test-slow: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow
@@ -114,7 +108,7 @@ traps: $(VENV)/.stamp-dev
 # LEFT_OUT adds arguments, such as --start checkpoints/mine.
 left-out: $(VENV)/.stamp-train
 	$(NEED_REAL_DRIVES)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_left_out.py --folder runs/left-out --data $(REAL_DRIVES) $(LEFT_OUT)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_left_out.py --folder runs/left-out --data "$(LANENET_SHARED_DATA)" $(LEFT_OUT)
 
 # From the table of the line above, or from its page.
 leaderboard: $(VENV)/.stamp-train
@@ -136,8 +130,9 @@ screenshots: $(VENV)/.stamp-dev
 fleet: $(VENV)/.stamp-dev
 	$(PYTEST) -m slow --numprocesses 0 tests/sim/test_fleet_on_a_cluster.py
 
+# With real drives none may be skipped.
 golden: $(VENV)/.stamp-dev
-	$(PYTEST) tests/golden
+	$(PYTEST) $(if $(LANENET_SHARED_DATA),--fail-on-skips any) tests/golden
 
 golden-renew: $(VENV)/.stamp-dev
 	$(BIN)/python tests/golden/renew.py
@@ -154,10 +149,11 @@ $(LANENET_DONKEYCAR)/.stamp: contrib/donkeycar.txt pyproject.toml $(KERNELS)
 	touch $@
 
 # Maps the drive first, which takes some minutes, unless that was done before.
-DRIVE ?= $(REAL_DRIVES)/donkey_circuit
+DRIVE ?= $(LANENET_SHARED_DATA)/donkey_circuit
 LANE_WIDTH ?= 59
 SHOWN ?= 700:859
 pictures: $(VENV)/.stamp-train
+	$(if $(filter file,$(origin DRIVE)),$(NEED_REAL_DRIVES))
 	test -e runs/pictures/$(notdir $(DRIVE))/map.yaml || \
 	  $(BIN)/lanenet map $(DRIVE) --lane-width $(LANE_WIDTH) --out runs/pictures/$(notdir $(DRIVE))
 	$(BIN)/python contrib/pictures.py runs/pictures/$(notdir $(DRIVE)) docs/images/drive.webp --frames $(SHOWN)
@@ -217,7 +213,7 @@ bench: $(VENV)/.stamp-train
 	$(BIN)/lanenet bench --model checkpoints/small --out runs/bench.json
 
 clean:
-	rm -rf runs site build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf site build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find lanenet datagen tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # A stamp is written only when pip has finished, so that an interrupted installation is taken up again.
