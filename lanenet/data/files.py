@@ -7,7 +7,6 @@ crash, a full disk or Ctrl-C never leaves half a file under the final name. One 
 
 from __future__ import annotations
 
-import fnmatch
 import importlib
 import json
 import math
@@ -39,8 +38,8 @@ FOLDER_KINDS: dict[str, tuple[str, ...]] = {
     "export": ("export.yaml", "README.md", "camera.yaml"),
     "checkpoint": ("checkpoint.yaml", "config.yaml", "metrics.json", "weights.safetensors", "model.onnx"),
 }
-#: Patterns of what else lanenet writes into such folders. All other names in them are those of others, and
-#: stay when the folder is replaced.
+#: What else lanenet writes into such folders. All other names in them are those of others, and stay when the
+#: folder is replaced.
 _ALSO_MADE: dict[str, tuple[str, ...]] = {
     "drive": ("camera.yaml", "images", "truth.csv", "track.json", "simulation.yaml"),
     "map": (
@@ -51,8 +50,10 @@ _ALSO_MADE: dict[str, tuple[str, ...]] = {
     "refused": (),
     "export": ("images", "train", "labels.parquet", "annotations.json", "label_data.json"),
     "checkpoint": (
-        *("run.yaml", "camera.yaml", "example.*", "robustness.json", "report.html", "results*", "curve.*"),
-        *("*_rasters.png", "MODEL_CARD.md", "DATA_SHEET.md", "data_sheet.json"),
+        *("run.yaml", "camera.yaml", "robustness.json", "report.html", "results.json", "results.md"),
+        *("results.png", "results-breakdown.png", "results-worst.jpg", "results-plain.jpg", "curve.csv"),
+        *("curve.png", "check_rasters.png", "calibration_rasters.png", "MODEL_CARD.md", "DATA_SHEET.md"),
+        *("data_sheet.json", "example.jpg", "example.png"),
     ),
 }
 
@@ -271,7 +272,7 @@ def _keep_others(path: Path, new: Path, kind: str) -> None:
         made += [str(one.get("map")) for one in members or () if isinstance(one, dict)]
     for own in path.iterdir():
         kept = new / own.name
-        if kept.exists() or any(fnmatch.fnmatchcase(own.name, pattern) for pattern in made):
+        if kept.exists() or own.name in made:
             continue
         if own.is_dir() and not own.is_symlink():
             shutil.copytree(own, kept, symlinks=True, copy_function=_link_or_copy)

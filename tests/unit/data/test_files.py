@@ -10,6 +10,7 @@ import pytest
 
 from lanenet import outputs
 from lanenet.data.files import (
+    FOLDER_KINDS,
     atomic_file,
     atomic_folder,
     check_destination,
@@ -127,6 +128,22 @@ def test_what_others_put_into_a_folder_stays(
     assert (path / "lanes" / "deep" / "b.csv").read_text() == "mine, too"
     assert (path / "album").is_symlink() and (path / "nowhere").is_symlink()
     assert names(elsewhere) == ["photo.jpg"]
+
+
+def test_others_files_in_a_checkpoint_stay_whose_names_look_like_its_own(tmp_path: Path) -> None:
+    def train() -> None:
+        with atomic_folder(tmp_path / "mine", "checkpoint") as folder:
+            for name in (*FOLDER_KINDS["checkpoint"], "results-worst.jpg", "example.png"):
+                (folder / name).write_text("format: lanenet-checkpoint/1\n")
+
+    train()
+    for name in ("results_of_my_race.txt", "example.docx", "curve.ods", "my_rasters.png"):
+        (tmp_path / "mine" / name).write_text("mine")
+    (tmp_path / "mine" / "results").mkdir()
+    before = names(tmp_path / "mine")
+    (tmp_path / "mine" / "results-plain.jpg").write_text("of the last run")
+    train()
+    assert names(tmp_path / "mine") == before
 
 
 def test_maps_of_others_in_a_joined_folder_stay(tmp_path: Path) -> None:
