@@ -513,7 +513,6 @@ def _bounded_table(path: Path, group: int | None, columns: Callable[[str], bool]
         raise ValueError(f"{size / MEBIBYTE:.1f} MB stand for more than {most / MEBIBYTE:.0f} MB") from None
     finally:
         arrow.set_memory_pool(pool)
-    table.validate(full=True)
     return table
 
 
@@ -521,6 +520,7 @@ def _whole_table(
     file: Any, group: int | None, columns: Callable[[str], bool] | None, size: int, most: int
 ) -> Any:
     """Read row groups of an open file, unless it says itself that they are too large."""
+    arrow = require("pyarrow", "data")
     about = file.metadata
     groups = list(range(about.num_row_groups)) if group is None else [group]
     names = None if columns is None else [name for name in file.schema_arrow.names if columns(name)]
@@ -528,6 +528,11 @@ def _whole_table(
     unpacked = sum(about.row_group(number).total_byte_size for number in groups)
     if unpacked <= most:
         table = file.read_row_groups(groups, columns=names, use_threads=False)
+        table.validate(full=True)
+        for k, field in enumerate(table.schema):
+            if arrow.types.is_dictionary(field.type):
+                # Holds each text once, however many rows have it.
+                table = table.set_column(k, field.name, table.column(k).cast(field.type.value_type))
         unpacked = table.nbytes
     if unpacked > most:
         raise ValueError(

@@ -3,13 +3,22 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tum import read_tum
 
-from lanenet.data.tables import ColumnSpec, read_csv, tum_from_poses, write_csv, write_tum
-from lanenet.errors import MapFormatError
+from lanenet.data.tables import (
+    ColumnSpec,
+    ParquetTable,
+    read_csv,
+    tum_from_poses,
+    write_csv,
+    write_parquet,
+    write_tum,
+)
+from lanenet.errors import LabelFormatError, MapFormatError
 
 SPECS = {
     "frame": ColumnSpec("int", low=0.0, increasing=True),
@@ -114,3 +123,15 @@ def test_an_unknown_pose_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(MapFormatError, match="row 1 is not finite"):
         write_tum(tmp_path / "a.tum", np.arange(2.0), np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_texts_by_number_are_read_as_far_as_they_may_be_unpacked(tmp_path: Path) -> None:
+    """Of pandas' categories each text stands once in the file."""
+    path = tmp_path / "a.parquet"
+    for texts, rows in ((["x", "y"], 3), ([2000 * "x"], 200_000)):
+        numbers = pa.array(np.arange(rows, dtype=np.int32) % len(texts))
+        write_parquet(path, {"file": pa.DictionaryArray.from_arrays(numbers, pa.array(texts))}, {})
+        if rows == 3:
+            assert ParquetTable(path).texts("file") == ["x", "y", "x"]
+    with pytest.raises(LabelFormatError, match=r"0\.\d MB stand for .*MB"):
+        ParquetTable(path)
