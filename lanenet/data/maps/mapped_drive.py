@@ -113,7 +113,10 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
         )
     missing = np.setdiff1d(drive_map.frames, drive.frames)
     if missing.size:
-        raise DriveFormatError(f"{source}: frame {int(missing[0])} of {map_folder} is not in it")
+        raise DriveFormatError(
+            f"{source}: frame {int(missing[0])} of {map_folder} is not in it; map it anew: "
+            f"{_map_again(drive_map, source, map_folder)}"
+        )
     settings_path = map_folder / SETTINGS_NAME
     found = read_yaml(settings_path).get("perception", {})
     perception = check_settings(PerceptionSettings, found, f"{settings_path}: perception")
@@ -125,7 +128,7 @@ def open_mapped_drive(map_folder: Path, drive_path: Path | None = None) -> Mappe
 def check_images(mapped: MappedDrive, map_folder: Path, every: bool = False) -> None:
     """Refuse a drive whose images are not those that were mapped: Donkeycar records into one folder again.
 
-    A map of an earlier version does not know its images; of a folder the times of its frames are compared.
+    Of a folder the times of the frames are compared, too: a map of an earlier version knows no more.
 
     Args:
         mapped: The map and its drive.
@@ -136,25 +139,30 @@ def check_images(mapped: MappedDrive, map_folder: Path, every: bool = False) -> 
         DriveFormatError: Says how many images differ, and what to type.
     """
     drive_map, drive = mapped.drive_map, mapped.drive.subset(mapped.rows)
+    other, what = np.zeros(len(mapped.rows), dtype=bool), "images"
     if drive_map.marks is not None:
-        other, what = other_images(drive, drive_map.marks, every), "images"
+        other = other_images(drive, drive_map.marks, every)
     else:
         _warn(
             f"{map_folder}: is a map of an earlier version, which does not know the images that it was made "
             f"from: whether {drive.path} still holds them is not checked; map it anew to have it checked"
         )
+    # Readers of videos have learned to read their times since.
+    if not other.any() and drive.times_trusted and drive.path.is_dir():
         by_s = np.abs((drive.t_s - drive.t_s[0]) - (drive_map.t_s - drive_map.t_s[0]))
-        # Readers of videos have learned to read their times since.
-        known = drive.times_trusted and drive.path.is_dir()
-        other, what = known & (by_s > _SAME_TIME_S), "times"
+        other, what = by_s > _SAME_TIME_S, "times"
         other &= other.mean() > _MOST_OTHER_TIMES
     if other.any():
-        again = drive_map.meta.model_copy(update={"drive": str(drive.path)}).command(map_folder)
         raise DriveFormatError(
             f"{drive.path}: of {len(other)} frames of {map_folder} the {what} of {int(other.sum())} are not "
             f"those that were mapped (first: frame {drive.frames[other][0]}): the drive was recorded anew or "
-            f"changed since; map it anew: {again}"
+            f"changed since; map it anew: {_map_again(drive_map, drive.path, map_folder)}"
         )
+
+
+def _map_again(drive_map: DriveMap, drive_path: Path, map_folder: Path) -> str:
+    """Return the command that maps the drive again, where it is now."""
+    return drive_map.meta.model_copy(update={"drive": str(drive_path)}).command(map_folder)
 
 
 def recorded_anew(map_folder: Path) -> list[str]:

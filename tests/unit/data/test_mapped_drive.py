@@ -208,6 +208,16 @@ def test_one_other_image_is_never_labelled(folder, tmp_path):
     label_map(folder, tmp_path / "l.parquet")
 
 
+def test_the_same_images_at_other_times_are_refused(folder):
+    drive = with_marks(folder)
+    images = [path.read_bytes() for path in drive.images.paths]
+    record_anew(drive, 0.06)
+    for path, image in zip(drive.images.paths, images, strict=True):
+        path.write_bytes(image)
+    with pytest.raises(DriveFormatError, match="the times of 25 are not those"):
+        open_mapped_drive(folder)
+
+
 def test_a_moved_drive_is_the_same(folder, tmp_path):
     drive = with_marks(folder)
     shutil.copytree(drive.path, tmp_path / "moved", copy_function=shutil.copyfile)
@@ -408,7 +418,9 @@ def test_a_drive_that_does_not_fit_is_refused(folder, tmp_path):
     with DriveWriter(tmp_path / "short") as writer:
         for k in range(10):
             writer.add(np.zeros((48, 64, 3), np.uint8), 0.05 * k)
-    with pytest.raises(DriveFormatError, match=r"short: frame 10 of .*map is not in it"):
+    with pytest.raises(
+        DriveFormatError, match=r"short: frame 10 of .*map is not in it; .*: lanenet map .*short "
+    ):
         read_map_frames(folder, drive_path=tmp_path / "short")
     with DriveWriter(tmp_path / "large") as writer:
         writer.add(np.zeros((96, 128, 3), np.uint8), 0.0)
