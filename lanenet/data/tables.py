@@ -384,7 +384,7 @@ class ParquetTable:
         for chunk in self._column(name).chunks:
             if not arrow.types.is_list(chunk.type) or not arrow.types.is_floating(chunk.type.value_type):
                 raise LabelFormatError(f"{self.path}: column {name!r}: expected lists of numbers")
-            values = chunk.flatten().to_numpy(zero_copy_only=False).astype(np.float32)
+            values = chunk.flatten().to_numpy(zero_copy_only=False).astype(np.float32, copy=False)
             lengths = chunk.value_lengths().fill_null(0).to_numpy(zero_copy_only=False)
             bad = np.isinf(values) if allow_nan else ~np.isfinite(values)
             if bad.any():
@@ -395,14 +395,14 @@ class ParquetTable:
             result += np.split(values, np.cumsum(lengths)[:-1])[: len(lengths)]
         return result
 
-    def raw(self, name: str) -> list[Any]:
-        """Return a column as plain Python values.
+    def raw(self, name: str) -> Iterator[Any]:
+        """Yield a column as plain Python values, one at a time.
 
         Raises:
             LabelFormatError: If the column is missing.
         """
-        values: list[Any] = self._column(name).to_pylist()
-        return values
+        for value in self._column(name):
+            yield value.as_py()
 
     def _column(self, name: str) -> Any:
         if name not in self._table.column_names:

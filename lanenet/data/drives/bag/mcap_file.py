@@ -17,15 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lanenet.data.drives.bag.topic import MAX_STORAGE, Messages, Topic
+from lanenet.data.drives.bag.topic import MAX_MESSAGE, MAX_STORAGE, Messages, Topic
 from lanenet.data.files import require
 from lanenet.errors import DriveFormatError
 from lanenet.reading import MEBIBYTE, open_regular
 
 _SIGN = b"\x89MCAP0\r\n"
-#: Of a chunk, unpacked. Chosen: writers begin a new one after a megabyte, or after one message that is
-#: larger, and an image of 16 megapixels without loss has 48 MB.
-_MAX_CHUNK = 48 * MEBIBYTE
+#: Of a chunk, unpacked: writers begin a new one after a megabyte, or after one message that is larger.
+_MAX_CHUNK = MAX_MESSAGE
 #: Of zstd; the most that its command unpacks without being asked, 128 MB.
 _MAX_WINDOW = 2**27
 #: Of all chunks: so much, and so many times the file's size. Chosen: images of a simulator, without loss and

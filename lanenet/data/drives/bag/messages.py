@@ -22,9 +22,12 @@ from lanenet.data.drives.bag.storage import reading
 from lanenet.data.drives.bag.topic import Topic
 from lanenet.data.files import require
 from lanenet.errors import DriveFormatError
-from lanenet.reading import MAX_PIXELS, decode_image
+from lanenet.reading import MAX_PIXELS, MEBIBYTE, decode_image
 
 _NS_PER_S = 1_000_000_000
+#: Of a message in JSON, [B], and its values. Chosen: an image of 4 megapixels without loss, and ten times the
+#: fields of an image; a value takes twenty times its text in memory.
+_MAX_JSON, _MAX_VALUES = 16 * MEBIBYTE, 100
 #: Names of codecs whose frames cannot be decoded one by one.
 _VIDEO_CODECS = frozenset(("h264", "h265", "hevc", "avc", "av1", "vp8", "vp9", "mpeg4", "theora", "ffmpeg"))
 #: What to do about them.
@@ -81,6 +84,13 @@ class Decoder:
         """
         with reading(Path(self.topic.name)):
             if self.topic.encoding == "json":
+                # Each value but the first follows one of these.
+                values = sum(data.count(sign) for sign in (b",", b"[", b"{"))
+                if len(data) > _MAX_JSON or values > _MAX_VALUES:
+                    raise DriveFormatError(
+                        f"{self.topic.name}: a message of {len(data) / MEBIBYTE:.1f} MB of JSON with about "
+                        f"{values} values, expected at most {_MAX_JSON / MEBIBYTE:.0f} MB and {_MAX_VALUES}"
+                    )
                 return json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
             if self._store is None:
                 self._store = _typestore()
@@ -151,14 +161,12 @@ def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, 
     """
     if named := sorted(_VIDEO_CODECS.intersection(re.split("[^a-z0-9]+", form))):
         raise DriveFormatError(f"{where}: images in {named[0]!r}, expected JPEG or PNG; {VIDEO_REMEDY}")
-    image = decode_image(pixels, where, DriveFormatError, cv2.IMREAD_UNCHANGED)
-    if image.dtype != np.uint8:
-        image = (image >> 8 if image.dtype == np.uint16 else np.clip(image, 0, 255)).astype(np.uint8)
+    # As gray or BGR with 8 bits, whatever is stored: 16 bits with alpha take 8 bytes a pixel.
+    image = decode_image(pixels, where, DriveFormatError, cv2.IMREAD_ANYCOLOR)
     if image.ndim == 2:
         encoding = re.sub("16$", "8", form.partition(";")[0].strip())
         code = _ENCODINGS[encoding][1] if encoding in _ENCODINGS and "bayer" in encoding else None
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if code is None else code))
-    image = np.ascontiguousarray(image[..., :3])
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR)) if "compressed rgb" in form else image
 
 

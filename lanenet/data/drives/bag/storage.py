@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import quote
 
 from lanenet.data.drives.bag.mcap_file import open_mcap
-from lanenet.data.drives.bag.topic import MAX_STORAGE, Messages, Topic
+from lanenet.data.drives.bag.topic import MAX_MESSAGE, MAX_STORAGE, Messages, Topic
 from lanenet.errors import DriveFormatError, LanenetError
 from lanenet.reading import (
     MAX_JSON,
@@ -164,10 +164,21 @@ def _opened_sqlite(path: Path, stack: ExitStack) -> tuple[list[Topic], Messages]
     whole = _whole_database(path, stack)
     address = f"file:{quote(str(whole.resolve()))}?mode=ro{'&immutable=1' if whole == path else ''}"
     database = stack.enter_context(closing(sqlite3.connect(address, uri=True, check_same_thread=False)))
-    # Not views, which may be queries without an end.
-    tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE)
+    # Not views, which may be queries without an end, nor tables with columns that are computed.
+    tables = database.execute(
+        "SELECT name FROM sqlite_master AS m WHERE sql LIKE 'CREATE TABLE%' "
+        "AND NOT EXISTS (SELECT * FROM pragma_table_xinfo(m.name) WHERE hidden)"
+    ).fetchall()
     if not {("topics",), ("messages",)} <= {*tables}:
-        raise DriveFormatError(f"{path}: expected the tables 'topics' and 'messages' of a ROS 2 bag")
+        raise DriveFormatError(
+            f"{path}: expected the tables 'topics' and 'messages' of a ROS 2 bag, with nothing computed"
+        )
+    # Rows that lack a column stand for its default.
+    claimed = database.execute("SELECT sum(length(data)) FROM messages").fetchone()[0] or 0
+    stored = sum(file.stat().st_size for file in (whole, _log_of(whole)) if is_regular(file))
+    if claimed > stored:
+        raise DriveFormatError(f"{path}: {stored} bytes stand for messages of {claimed}")
     counts = dict(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
     listed = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
     known = {str(name): number for number, name, _, _ in listed}

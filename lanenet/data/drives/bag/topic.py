@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from lanenet.errors import counted
+from lanenet.reading import MEBIBYTE
 
 #: Of a storage file, [B]; chosen: an hour of raw images of a megapixel at 30 frames/s has 0.3 TB.
 MAX_STORAGE = 2**41
+#: Of a message, unpacked, [B]. Chosen: an image of 16 megapixels without loss has 48 MB.
+MAX_MESSAGE = 48 * MEBIBYTE
 #: Encodings of messages: that of ROS 2, and Foxglove's.
 READABLE = ("cdr", "json")
 #: Yields time of recording, [ns], and bytes of a topic's messages, in order, those from a time on.
