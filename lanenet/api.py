@@ -134,12 +134,12 @@ def map(
     request = MapRequest(
         Path(drive),
         float(lane_width_cm),
-        None if camera is None else Path(camera),
+        _camera_path(camera),
         refine_camera,
-        _float(wheelbase_cm),
-        _float(camera_height_cm),
+        _car_length("wheelbase_cm", wheelbase_cm),
+        _car_length("camera_height_cm", camera_height_cm),
         _float(tape_width_cm),
-        frames,
+        _frames(frames),
     )
     if not force:
         check_same_drive(Path(out), Path(drive))
@@ -234,13 +234,16 @@ def train(
         check_lane_width(width_cm)
     measured = Measured(
         width_cm,
-        None if camera is None else Path(camera),
-        _float(wheelbase_cm),
-        _float(camera_height_cm),
+        _camera_path(camera),
+        _car_length("wheelbase_cm", wheelbase_cm),
+        _car_length("camera_height_cm", camera_height_cm),
         _float(tape_width_cm),
-        frames,
+        _frames(frames),
     )
     paths = _paths(source)
+    for word in overrides:
+        if not isinstance(word, str):
+            raise ConfigError(f"{word!r}: expected a setting as a text, as 'learn.epochs=5'")
     with held_to_the_end():
         if paths is None or is_config(paths[0]):
             given = [*([] if name is None else ["name"]), *measured.given]
@@ -312,12 +315,12 @@ def detect(
         Path(out),
         model=None if model is None else pulled(model),
         detector=detector,
-        camera=None if camera is None else Path(camera),
+        camera=_camera_path(camera),
         video=None if video is None else Path(video),
         lane_width_cm=width_cm,
         marking_cm=_float(marking_cm),
         any_camera=any_camera,
-        frames=frames,
+        frames=_frames(frames),
         skip_unreadable=skip_unreadable,
         config=None if config is None else Path(config),
         mask=None if mask is None else str(mask),
@@ -328,9 +331,61 @@ def detect(
 
 def _paths(source: object) -> list[Path] | None:
     """Return the paths of drives, or of a config; None for the settings of a config."""
+    from collections.abc import Iterable, Mapping
+
+    from lanenet.config import Settings
+    from lanenet.errors import ConfigError
+
+    if isinstance(source, Settings | Mapping):
+        return None
     if isinstance(source, str | Path):
         return [Path(source)]
-    return [Path(path) for path in source] if isinstance(source, list | tuple) and source else None
+    paths = [Path(path) for path in source] if isinstance(source, Iterable) else []
+    if not paths:
+        raise ConfigError(f"{source!r}: expected drives, maps or label sets, or a config")
+    return sorted(paths) if isinstance(source, set | frozenset) else paths
+
+
+def _camera_path(camera: object) -> Path | None:
+    """Return where a camera is to be read; a camera itself is refused, since maps write down the path."""
+    from lanenet.errors import ConfigError
+
+    if camera is None or isinstance(camera, str | Path):
+        return None if camera is None else Path(camera)
+    raise ConfigError(
+        f"camera=...: expected the path of a camera file or of a map, found {type(camera).__name__}; "
+        "lanenet.data.camera_file.write_camera writes a camera to a file"
+    )
+
+
+def _frames(frames: Any) -> tuple[int, int] | None:
+    """Check the numbers of a first and a last frame."""
+    from operator import index
+
+    from lanenet.errors import ConfigError
+
+    if frames is None:
+        return None
+    try:
+        first, last = (index(number) for number in frames)
+    except (TypeError, ValueError):
+        first, last = 0, -1
+    if not 0 <= first <= last:
+        raise ConfigError(f"frames={frames!r}: expected the first and the last number, as (700, 999)")
+    return first, last
+
+
+def _car_length(name: str, value: int | float | None) -> float | None:
+    """Check a length of the car, as its option does."""
+    from lanenet.cli.shared.options import check_car_length
+    from lanenet.errors import ConfigError
+
+    if value is not None:
+        try:
+            check_car_length(float(value))
+        except ConfigError as error:
+            raise ConfigError(f"{name}={error}") from None
+    return _float(value)
 
 
 def _float(value: int | float | None) -> float | None:

@@ -162,8 +162,10 @@ def test_train_takes_a_drive_as_the_command_does(monkeypatch: pytest.MonkeyPatch
     assert CliRunner().invoke(app, words).exit_code == 0
     assert asked[1] == asked[0] and Path("runs/x/x.yaml").read_text() == written
     write_drive(tmp_path / "tub2", 90)
-    lanenet.train(["tub", Path("tub2")], lane_width_cm=50, name="both")
-    assert [each.path.name for each in asked[2].data.drives] == ["tub", "tub2"]
+    both: Any
+    for both in (["tub", Path("tub2")], {"tub", "tub2"}, iter(["tub", "tub2"])):
+        lanenet.train(both, lane_width_cm=50, name="both")
+        assert [each.path.name for each in asked[-1].data.drives] == ["tub", "tub2"]
     with pytest.raises(ConfigError, match=r"expected a name .*lanenet\.train\('tub', name='tub'\)"):
         lanenet.train("tub", lane_width_cm=50)
     with pytest.raises(ConfigError, match=r"0\.5 m are 50 cm"):
@@ -172,6 +174,32 @@ def test_train_takes_a_drive_as_the_command_does(monkeypatch: pytest.MonkeyPatch
     for given in wrong:
         with pytest.raises(ConfigError, match=f"{next(iter(given))}=.*a config has a key"):
             lanenet.train("runs/x/x.yaml", **given)
+
+
+def test_what_is_no_argument_is_refused_with_what_was_expected(tmp_path: Path) -> None:
+    camera: Any = read_camera(SMALL / "camera.yaml")
+    wrong: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"camera": camera}, r"camera=\.\.\.: expected the path .*write_camera"),
+        ({"frames": "0:2"}, r"frames='0:2': expected the first and the last"),
+        ({"frames": (9, 7)}, "expected the first and the last"),
+        ({"wheelbase_cm": -3}, "wheelbase_cm=-3: expected"),
+        ({"camera_height_cm": 0.2}, "camera_height_cm=0.2: .*0.2 m are 20 cm"),
+    )
+    for given, words in wrong:
+        with pytest.raises(ConfigError, match=words):
+            lanenet.map("tub", tmp_path / "m", lane_width_cm=40, **given)
+        with pytest.raises(ConfigError, match=words):
+            lanenet.train("tub", name="x", lane_width_cm=40, **given)
+        if "wheelbase_cm" not in given and "camera_height_cm" not in given:
+            with pytest.raises(ConfigError, match=words):
+                lanenet.detect("tub", tmp_path / "l.csv", detector="hough", **given)
+    nothing: Any
+    for nothing in ((), None):
+        with pytest.raises(ConfigError, match="expected drives"):
+            lanenet.train(nothing, name="x")
+    override: Any = {"learn.epochs": 5}
+    with pytest.raises(ConfigError, match=r"expected a setting .*learn\.epochs=5"):
+        lanenet.train("tub", override, name="x")
 
 
 def test_detect_writes_what_the_command_writes(tmp_path: Path) -> None:

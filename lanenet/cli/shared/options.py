@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import math
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,6 +21,9 @@ from lanenet.perception.registry import detector_names, listed
 
 #: A length is at least this; chosen: the thinnest tape has ten times as much.
 _LEAST_CM = 0.1
+#: The distance of axles and the height of a lens are at least this; chosen: less than the smallest model car
+#: has, and more than the metres of any.
+_LEAST_CAR_CM = 2.0
 #: Units that may follow a length, in cm; without one it is in cm.
 _UNITS_CM = {"": 1.0, "cm": 1.0, "mm": 0.1, "m": 100.0, "in": 2.54}
 
@@ -60,6 +64,30 @@ def lane_cm(text: str | float) -> float:
     return value_cm
 
 
+def car_length_cm(text: str | float) -> float:
+    """Read a length of the car as :func:`length_cm` does, and refuse one in metres: another parser."""
+    value_cm = length_cm(text)
+    try:
+        check_car_length(value_cm)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error)) from None
+    return value_cm
+
+
+def check_car_length(value_cm: float) -> None:
+    """Refuse a distance of axles, or a height of the lens, that is no centimetres.
+
+    Raises:
+        ConfigError: With the centimetres of what seem to be metres.
+    """
+    if not _LEAST_CAR_CM <= value_cm < math.inf:
+        metres = f"; {value_cm:g} m are {100.0 * value_cm:g} cm: type {100.0 * value_cm:g}"
+        raise ConfigError(
+            f"{value_cm:g}: expected a length of the car in cm, {_LEAST_CAR_CM:g} at least"
+            f"{metres if 0.0 < value_cm < _LEAST_CAR_CM else ''}"
+        )
+
+
 def frame_range(text: str) -> tuple[int, int]:
     """Read the numbers of a first and a last frame, ``FIRST:LAST``: the parser of such options."""
     first, colon, last = text.partition(":")
@@ -90,7 +118,7 @@ WheelbaseOption = Annotated[
     float | None,
     typer.Option(
         "--wheelbase",
-        parser=length_cm,
+        parser=car_length_cm,
         metavar="CM",
         help=f"Distance between the car's axles, cm; default: nominally {NOMINAL_WHEELBASE_CM:g}.",
     ),
@@ -99,7 +127,7 @@ CameraHeightOption = Annotated[
     float | None,
     typer.Option(
         "--camera-height",
-        parser=length_cm,
+        parser=car_length_cm,
         metavar="CM",
         help="Height of the lens above the road, cm: helps to find a camera that is not known.",
     ),

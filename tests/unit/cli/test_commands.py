@@ -280,6 +280,12 @@ def test_a_lane_width_that_is_no_centimetres_is_a_usage_error(width: str, instea
     assert instead in result.stderr and ("type" in result.stderr) == ("type" in instead)
 
 
+@pytest.mark.parametrize("option", ["--wheelbase", "--camera-height"])
+def test_a_length_of_the_car_in_metres_is_a_usage_error(option: str) -> None:
+    result = run("map", "tub", "--lane-width", "40", "--out", "map", option, "0.17")
+    assert result.exit_code == 2 and option in result.stderr and "0.17 m are 17 cm: type 17" in result.stderr
+
+
 @pytest.mark.parametrize("width", ["40", "40cm", "40 CM", "400mm", "0.4 m"])
 def test_a_length_may_have_its_unit(width: str) -> None:
     assert lane_cm(width) == length_cm(width) == pytest.approx(40.0)
