@@ -126,7 +126,7 @@ class LanePainter:
         #: The settings of the last frame: those for roads where it shows one.
         self._chosen = self.settings
         self._for_roads = _with_road_settings(self.settings)
-        self._frames = self._frames_of_roads = 0
+        self._frames = self._frames_of_roads = self._small_frames = 0
 
     def reset(self) -> None:
         """Forget what earlier frames showed."""
@@ -136,7 +136,12 @@ class LanePainter:
 
     @property
     def hint(self) -> str:
-        """Which settings the frames so far were given, across resets, and how to choose others."""
+        """Which settings the frames so far were given, across resets, or that they were too small for any."""
+        if self._small_frames:
+            return (
+                f"the painter finds nothing in frames of fewer than {_MIN_SIDE_PX} px, as in "
+                f"{counted(self._small_frames, 'frame')} here"
+            )
         if self.camera is not None or self._frames == 0:
             return ""
         roads = self._frames_of_roads
@@ -161,7 +166,8 @@ class LanePainter:
             self.reset()
         self._shape = (height, width)
         if min(height, width) < _MIN_SIDE_PX:
-            return LaneEstimate()
+            self._small_frames += 1
+            return LaneEstimate(lines_px=self.last.numbers_px(width, height))
         trapezoid = self._find_region(frame)
         found = self._smooth(self._find(frame, trapezoid), trapezoid)
         rows = np.full((2, len(ROWS_CM)), np.nan)

@@ -412,3 +412,11 @@ def test_wrong_input_is_named() -> None:
         check_settings(PainterSettings, {"edges": {"blur_px": 4}}, "test")
     with pytest.raises(ConfigError, match="below low"):
         check_settings(PainterSettings, {"edges": {"high": 40.0}}, "test")
+
+
+def test_a_frame_too_small_for_lines_has_the_columns_of_any_other_and_is_said() -> None:
+    painter = LanePainter()
+    for sides in ((47, 300), (300, 47)):
+        lines_px = painter.detect(np.zeros((*sides, 3), np.uint8)).lines_px
+        assert lines_px is not None and np.isnan(lines_px).all()
+    assert "fewer than 48 px, as in 2 frames here" in painter.hint
