@@ -75,6 +75,13 @@ def missing(then: Open) -> Open:
     return lambda tmp_path: then(tmp_path / "nowhere")
 
 
+def standing(folder: Path) -> Path:
+    path = write_drive(folder / "lap", 5)
+    edit(path / "frames.csv", "jpg,0.15", "jpg,0.1")
+    edit(path / "frames.csv", "jpg,0.2", "jpg,0.1")
+    return path
+
+
 def pose_unknown(tmp_path: Path) -> Any:
     row = {name: float(j) for j, name in enumerate(TRUTH_NAMES)}
     with DriveWriter(tmp_path / "sim") as writer:
@@ -122,18 +129,6 @@ def linked(name: str, target: str) -> Open:
     return act
 
 
-def manifest(**changes: Any) -> Open:
-    """A tub whose list of catalogs has other values, opened."""
-
-    def act(tmp_path: Path) -> Any:
-        path = write_tub(tmp_path / "tub", [record(0), record(1)]) / "manifest.json"
-        *first, last = path.read_text().splitlines()
-        path.write_text("\n".join([*first, json.dumps({**json.loads(last), **changes})]) + "\n")
-        return open_drive(tmp_path / "tub")
-
-    return act
-
-
 def png(width: int, height: int) -> bytes:
     """The beginning of an image that would be this large."""
     return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", width, height) + b"\x08\x02\0\0\0" + b"IEND"
@@ -152,17 +147,17 @@ BAD = [
     Bad("a command is nan", frames(ROW, ROW[:-4] + "nan"), D, ("frames.csv", "line 3", "'steering_rad'")),
     Bad("a command is empty", frames(ROW, ROW.replace("60", "")), D, ("line 3", "'speed_cm_s'")),
     Bad("steering in degrees", frames(ROW, ROW[:-4] + "17"), D, ("line 3", "'steering_rad'", "17")),
-    Bad("time stands", frames("4,images/000004.jpg,0.2", "4,images/000004.jpg,0.15"), D, ("line 6", "'t_s'")),
+    Bad(
+        "time stands again and again",
+        lambda folder: open_drive(standing(folder)),
+        D,
+        ("frames.csv", "'t_s'", "do not increase 2 times, first at frame 3"),
+    ),
     Bad("a frame twice", frames("4,images/000004.jpg", "3,images/000004.jpg"), D, ("line 6", "'frame'")),
     Bad("a misspelt column", frames("steering_rad", "steering_deg"), D, ("'steering_deg'", "'steering_rad'")),
     Bad("no column of times", frames("t_s", "time"), D, ("frames.csv", "'t_s'", "missing")),
     Bad("no rows", holding("frames.csv", "frame,file,t_s\n"), D, ("frames.csv", "no frames")),
     Bad("no image", without("images/*"), D, ("lap", "2 frames", "000000.jpg")),
-    Bad(
-        "an image above", frames("images/000001.jpg", "../secret.jpg"), D, ("frame 1", "'file'", "../secret")
-    ),
-    Bad("an image below and above", frames("images/000001", "images/../../a"), D, ("frame 1", "'file'")),
-    Bad("an image elsewhere", frames("images/000001.jpg", "/dev/zero"), D, ("frame 1", "/dev/zero")),
     Bad("an image of no name", frames("images/000001.jpg", "a\0b"), D, ("frames.csv",)),
     Bad("an image by a link", linked("images/000001.jpg", "{}/elsewhere"), D, ("frame 1", "000001.jpg")),
     Bad("images by a link", linked("images", "{}/elsewhere"), D, ("frame 0", "images/000000.jpg")),
@@ -218,8 +213,6 @@ BAD = [
         D,
         ("manifest.json", "'deleted_indexes'"),
     ),
-    Bad("a catalog above", manifest(paths=["../x.catalog"]), D, ("manifest.json", "'paths'", "../x")),
-    Bad("a catalog elsewhere", manifest(paths=["/dev/zero"]), D, ("manifest.json", "'paths'", "/dev/zero")),
     Bad("a manifest nested deeply", holding("manifest.json", "[" * 100_000), D, ("manifest.json",)),
     Bad(
         "types that are lists", holding("manifest.json", '[[1]]\n[[1]]\n{"paths": []}'), D, ("manifest.json",)

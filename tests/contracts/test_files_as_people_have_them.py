@@ -137,6 +137,11 @@ def in_windows(path: Path) -> None:
         catalog.rename(path / "data" / catalog.name)
 
 
+def listed_before(before: str) -> Make:
+    """A tub whose manifest names each catalog with a folder before it."""
+    return tub(lambda path: edit(path / "manifest.json", '"catalog_', f'"{before}catalog_'))
+
+
 def version_1(folder: Path) -> Path:
     for k in range(12):
         cv2.imwrite(str(folder / f"{k}_cam-image_array_.jpg"), frame_image(k))
@@ -224,6 +229,9 @@ TUBS = [
         list(range(24)),
     ),
     Case("a tub of Windows", tub(in_windows), EIGHT),
+    Case("catalogs named as on the car", listed_before("/home/pi/mycar/data/tub_1/"), EIGHT),
+    Case("catalogs named as in Windows", listed_before("C:\\\\mycar\\\\data\\\\"), EIGHT),
+    Case("catalogs named from elsewhere", listed_before("../data/"), EIGHT),
     Case("images named with their folder", renamed_in_rows("images/"), EIGHT),
     Case("images named as on the car", renamed_in_rows("/home/pi/mycar/data/tub_1/images/"), EIGHT),
     Case("images named as in Windows", renamed_in_rows("C:\\\\mycar\\\\data\\\\images\\\\"), EIGHT),
@@ -295,12 +303,52 @@ def test_a_clock_that_was_set_forward_is_no_break(tmp_path: Path, kind: str) -> 
     assert np.flatnonzero(open_drive(write_tub(tmp_path / "two", rows)).breaks).tolist() == [4]
 
 
-def test_a_table_of_windows_names_its_images(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "before", ["images\\", "/home/pi/lap/images/", "C:\\lap\\images\\", "../lap/images/", "images/../../a/"]
+)
+def test_a_table_names_its_images_as_on_another_computer(tmp_path: Path, before: str) -> None:
     path = write_drive(tmp_path / "lap", 3)
     text = (path / "frames.csv").read_text()
-    (path / "frames.csv").write_text(text.replace("images/", "images\\"))
+    (path / "frames.csv").write_text(text.replace("images/", before))
     drive = open_drive(path)
     assert not drive.problems and number(drive.image(2)) == 2
+    for file in path.glob("images/*"):
+        file.rename(path / file.name)
+    assert number(open_drive(path).image(2)) == 2
+
+
+@pytest.mark.parametrize("name", ["../secret.jpg", "images/../../secret.jpg", "/dev/zero", "..", "/"])
+def test_no_name_leads_out_of_a_drive(tmp_path: Path, name: str) -> None:
+    cv2.imwrite(str(tmp_path / "secret.jpg"), frame_image(1))
+    path = write_drive(tmp_path / "lap", 3)
+    edit(path / "frames.csv", "images/000001.jpg", name)
+    drive = open_drive(path)
+    assert f"1 of 3 images are missing (first: frame 1, {name})" in drive.problems[0]
+    with pytest.raises(DriveFormatError, match="frame 1"):
+        drive.image(1)
+    path = write_tub(tmp_path / "tub", [record(0), with_image(1, "b.jpg"), record(2)])
+    edit(path / "catalog_0.catalog", '"b.jpg"', f'"{name}"')
+    edit(path / "manifest.json", '"catalog_0', f'"{name}", "catalog_0')
+    drive = open_drive(path)
+    assert drive.frames.tolist() == [0, 2]
+    assert f"catalogs listed but not there: {name}" in drive.problems[0]
+
+
+@pytest.mark.parametrize("kind", ["folder", "video"])
+def test_a_clock_that_was_set_back_goes_on(tmp_path: Path, kind: str) -> None:
+    times = [0.05 * k - (1.0 if k > 4 else 0.0) for k in range(12)]
+    if kind == "video":
+        path = video()(tmp_path)
+        rows = [f"{k},{t:.2f}" for k, t in enumerate(times)]
+        (tmp_path / "clip.csv").write_text("\n".join(["frame,t_s", *rows]))
+    else:
+        path = write_drive(tmp_path / "lap", 12)
+        head, *lines = [line.split(",") for line in (path / "frames.csv").read_text().splitlines()]
+        lines = [[*line[:2], f"{t:.2f}", *line[3:]] for line, t in zip(lines, times, strict=True)]
+        (path / "frames.csv").write_text("\n".join(map(",".join, [head, *lines])) + "\n")
+    drive = open_drive(path)
+    np.testing.assert_allclose(drive.t_s, 0.05 * np.arange(12), atol=1e-9)
+    assert "the clock goes back or stands 1 times, first at frame 5" in "; ".join(drive.problems)
 
 
 def test_an_unreadable_image_names_the_option_that_goes_on(tmp_path: Path) -> None:
@@ -359,6 +407,7 @@ VIDEOS = [
     Case("a constant rate", video(), TWELVE),
     Case("a constant rate in another container", video(name="clip.mkv"), TWELVE),
     Case("a rate that varies", video(timed((6, 1), (6, 3))), TWELVE, ("rate varies, steps of 50 to 150 ms",)),
+    Case("times that stand", video(timed((6, 0), (6, 1))), TWELVE, ("do not increase", "as its header says")),
     Case("nothing but JPEGs", raw_mjpeg, TWELVE, ("no times", "20 frames/s", "clip.csv")),
     Case("a phone held upright", video(turned(90)), TWELVE),
     Case(
@@ -402,6 +451,7 @@ def test_the_times_of_a_video_are_those_of_its_frames(tmp_path: Path) -> None:
     sent = pickle.loads(pickle.dumps(drive))
     np.testing.assert_array_equal(sent.image(33), in_order[33])
     assert not open_drive(raw_mjpeg(tmp_path)).times_trusted
+    assert not open_drive(video(timed((6, 0), (6, 1)), "stands.mp4")(tmp_path)).times_trusted
 
 
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import TracebackType
 
 import cv2
@@ -22,6 +22,7 @@ from lanenet.data.drives.recording import (
     DriveFormat,
     ImageFiles,
     RecordedFrames,
+    named_file,
     read_times,
     write_drive_file,
 )
@@ -49,18 +50,17 @@ def read_folder(path: Path) -> RecordedFrames:
     """
     inside = FolderFiles(path)
     table = inside.file(FRAMES_FILE, path, DriveFormatError)
-    columns, commands = read_times(table, file=ColumnSpec("text"))
-    frames = columns["frame"]
-    # Tables of Windows.
-    names = [name.replace("\\", "/") for name in columns["file"].tolist()]
+    columns, commands, problems = read_times(table, file=ColumnSpec("text"))
+    frames, names = columns["frame"], columns["file"].tolist()
+    files = [
+        named_file(inside, name, f"{table}: frame {number}, column 'file'", "images")
+        for number, name in zip(frames, names, strict=True)
+    ]
+    missing = [i for i, file in enumerate(files) if file is None]
+    # One that is not there says so when it is read.
     images = ImageFiles(
-        [
-            inside.file(name, f"{table}: frame {number}, column 'file'", DriveFormatError)
-            for number, name in zip(frames, names, strict=True)
-        ]
+        [file or path / "images" / PurePath(name).name for file, name in zip(files, names, strict=True)]
     )
-    missing = [i for i, image in enumerate(images.paths) if not is_regular(image)]
-    problems: list[str] = []
     if is_torn(table):
         problems.append(f"{table}: its last line is cut off and left out")
     if missing:

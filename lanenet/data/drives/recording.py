@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -25,7 +25,7 @@ from lanenet.data.tables import ColumnSpec, read_csv
 from lanenet.errors import ConfigError, DriveFormatError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import LaneWidthCm
-from lanenet.reading import MAX_IMAGE, FolderFiles, decode_image, read_bytes
+from lanenet.reading import MAX_IMAGE, FolderFiles, decode_image, is_regular, read_bytes
 
 #: A longer pause is a break: even a slow car has left the road that its last frame showed.
 MAX_PAUSE_S = 2.0
@@ -33,6 +33,11 @@ MAX_PAUSE_S = 2.0
 #: A longer step within a session is a clock that was set, as that of a Raspberry Pi, which has no battery,
 #: once it finds a network. Chosen: a day, which no car drives on.
 _LEAP_S = 86_400.0
+
+#: Where no step of a clock is left: that of Donkeycar's default rate (DRIVE_LOOP_HZ = 20).
+DEFAULT_PERIOD_S = 0.05
+#: Share of the steps in which the clock may stand or go back, one in any case: it was set. Chosen.
+_SET_SHARE = 0.01
 
 #: What a drive can be on disk.
 Kind = Literal["folder", "tub", "video", "bag"]
@@ -222,6 +227,28 @@ class ImageFiles:
         return read_bytes(self.paths[row], DriveFormatError, MAX_IMAGE)
 
 
+def named_file(inside: FolderFiles, name: str, where: object, *folders: str) -> Path | None:
+    """Return the file that a recording names, under that name or its last part; None if it is not there.
+
+    Recordings name their files as they lay on the computer that made them, perhaps one with Windows.
+
+    Args:
+        inside: The files of the drive.
+        name: The name.
+        where: File, and key or line, in which the name stands.
+        *folders: Folders of the drive in which it is looked for; the drive itself comes first.
+
+    Raises:
+        DriveFormatError: If a link leads out of the drive, or no file can have such a name.
+    """
+    pure = PurePosixPath(name.replace("\\", "/"))
+    names = [] if pure.is_absolute() or ".." in pure.parts else [str(pure)]
+    names += [pure.name] if pure.name not in ("", "..") else []
+    places = (f"{folder}/{each}" if folder else each for each in names for folder in ("", *folders))
+    files = (inside.file(place, where, DriveFormatError) for place in places)
+    return next(filter(is_regular, files), None)
+
+
 @dataclass(frozen=True, eq=False)
 class RecordedFrames:
     """What a reader of a drive format found.
@@ -313,6 +340,30 @@ def assemble_drive(path: Path, recorded: RecordedFrames) -> Drive:
     )
 
 
+def goes_back_often(frames: Int[np.ndarray, "n"], t_s: Float[np.ndarray, "n"]) -> str | None:
+    """Say where times do not increase, if that is too often for a clock that was set; None if it is not."""
+    back = np.diff(t_s) <= 0.0
+    if back.sum() <= max(1.0, _SET_SHARE * len(back)):
+        return None
+    return f"do not increase {back.sum()} times, first at frame {frames[1:][back][0]}"
+
+
+def without_jumps(
+    path: Path, frames: Int[np.ndarray, "n"], t_s: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n"], list[str]]:
+    """Put a typical step where the clock stands or goes back; returns the times, and what was wrong."""
+    steps_s = np.diff(t_s)
+    back = steps_s <= 0.0
+    if not back.any():
+        return t_s, []
+    typical_s = float(np.median(steps_s[~back])) if (~back).any() else DEFAULT_PERIOD_S
+    mended_s = t_s[0] + np.concatenate([[0.0], np.cumsum(np.where(back, typical_s, steps_s))])
+    return mended_s, [
+        f"{path}: the clock goes back or stands {back.sum()} times, first at frame {frames[1:][back][0]}; a "
+        "typical step is taken there"
+    ]
+
+
 def _without_leaps(path: Path, recorded: RecordedFrames) -> tuple[Float[np.ndarray, "n"], list[str]]:
     """Put a typical step where the clock was set forward; returns the times, and what was wrong."""
     steps_s = np.diff(recorded.t_s)
@@ -400,7 +451,7 @@ COMMAND_SPECS: dict[str, ColumnSpec] = {
 }
 
 
-def read_times(path: Path, **more: ColumnSpec) -> tuple[dict[str, np.ndarray], Commands]:
+def read_times(path: Path, **more: ColumnSpec) -> tuple[dict[str, np.ndarray], Commands, list[str]]:
     """Read a table of frames: number, time and commands.
 
     A last line that was cut off while it was written is left out.
@@ -410,22 +461,25 @@ def read_times(path: Path, **more: ColumnSpec) -> tuple[dict[str, np.ndarray], C
         **more: Further columns that the table must have.
 
     Returns:
-        The columns, and the commands among them.
+        The columns, the commands among them, and what was wrong with the times.
 
     Raises:
-        DriveFormatError: If a column is missing, a cell is not a number or out of range, frame numbers or
-            times do not increase, or there is no row; names line and column.
+        DriveFormatError: If a column is missing, a cell is not a number or out of range, frame numbers do
+            not increase, or there is no row; names line and column. If times go back more than now and then.
     """
     specs: dict[str, Any] = {
         "frame": ColumnSpec("int", low=0.0, increasing=True),
-        "t_s": ColumnSpec(increasing=True, low=-MAX_TIME_S, high=MAX_TIME_S),
+        "t_s": ColumnSpec(low=-MAX_TIME_S, high=MAX_TIME_S),
         **COMMAND_SPECS,
         **more,
     }
     columns = read_csv(path, specs, skip_torn=True)
     if len(columns["frame"]) == 0:
         raise DriveFormatError(f"{path}: the drive has no frames")
-    return columns, Commands(**{name: columns.get(name) for name in COMMAND_NAMES})
+    if (often := goes_back_often(columns["frame"], columns["t_s"])) is not None:
+        raise DriveFormatError(f"{path}: column 't_s': times {often}")
+    columns["t_s"], problems = without_jumps(path, columns["frame"], columns["t_s"])
+    return columns, Commands(**{name: columns.get(name) for name in COMMAND_NAMES}), problems
 
 
 def _image_size(images: ImageSource, rows: Int[np.ndarray, "n"], where: Path) -> tuple[int, int]:

@@ -9,26 +9,32 @@ from __future__ import annotations
 
 import itertools
 import os
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from lanenet.data.drives.recording import DRIVE_FILE, Commands, DriveFormat, ImageFiles, RecordedFrames
+from lanenet.data.drives.recording import (
+    DEFAULT_PERIOD_S,
+    DRIVE_FILE,
+    Commands,
+    DriveFormat,
+    ImageFiles,
+    RecordedFrames,
+    goes_back_often,
+    named_file,
+    without_jumps,
+)
 from lanenet.data.drives.tub_index import CATALOGS, MANIFEST_FILE, read_index
 from lanenet.data.drives.tub_rows import Record, ordered, read_catalog
 from lanenet.errors import DriveFormatError
 from lanenet.reading import FolderFiles, first_line, is_folder, is_regular
 
-#: Used where the timestamps cannot be those of the frames: Donkeycar's default rate (DRIVE_LOOP_HZ = 20).
-DEFAULT_PERIOD_S = 0.05
 #: Timestamps closer than this are not those of the frames, and share of such steps above which none is used.
 #: Long steps say nothing against a clock: Donkeycar records only while the throttle is pressed. Measured:
 #: ``donkey_circuit``, whose timestamps are useless, has a median step of 3 ms, three sound tubs have 50 to
 #: 100 ms, and 0 to 0.6 % of their steps are irregular.
 _MIN_STEP_S, _SHORT_SHARE = 0.01, 0.2
-#: Share of the steps in which the clock may stand or go back, one in any case: it was set. Chosen.
-_SET_SHARE = 0.01
 
 
 def read_tub(path: Path) -> RecordedFrames:
@@ -78,18 +84,14 @@ def read_tub(path: Path) -> RecordedFrames:
     time_ms = np.array([record.time_ms for record in records])
     distrust = _distrust(frames, time_ms)
     if distrust is not None:
+        t_s = (frames - frames[0]) * DEFAULT_PERIOD_S
         problems.append(
             f"{path}: timestamps not used, {distrust}; taking {1.0 / DEFAULT_PERIOD_S:.0f} frames/s, so that "
             "gaps in the recording are seen by missing frame numbers only"
         )
     else:
-        time_ms, jumps = _without_jumps(time_ms)
-        if jumps.any():
-            first = int(np.flatnonzero(jumps)[0])
-            problems.append(
-                f"{path}: the clock goes back or stands {jumps.sum()} times, first at frame {frames[first]}; "
-                "a typical step is taken there"
-            )
+        t_s, jumps = without_jumps(path, frames, (time_ms - time_ms[0]) / 1000.0)
+        problems += jumps
     angle = np.array([record.angle for record in records])
     throttle = np.array([record.throttle for record in records])
     if np.isnan(angle).any():
@@ -108,7 +110,7 @@ def read_tub(path: Path) -> RecordedFrames:
     sessions = itertools.pairwise(record.session for record in records)
     return RecordedFrames(
         frames,
-        (time_ms - time_ms[0]) / 1000.0 if distrust is None else (frames - frames[0]) * DEFAULT_PERIOD_S,
+        t_s,
         Commands(
             angle=None if np.isnan(angle).all() else angle,
             throttle=None if np.isnan(throttle).all() else throttle,
@@ -171,12 +173,8 @@ def _image_file(path: Path, name: str, names: set[str], inside: FolderFiles) -> 
     Raises:
         DriveFormatError: If a link leads out of the tub.
     """
-    pure = PurePosixPath(name)
-    if not pure.is_absolute() and ".." not in pure.parts and len(pure.parts) > 1:
-        for below in (name, f"images/{name}"):
-            if is_regular(file := inside.file(below, path, DriveFormatError)):
-                return file
-    return path / "images" / pure.name if pure.name in names else None
+    # Most are plain names, of any number: no look at the disk for each.
+    return path / "images" / name if name in names else named_file(inside, name, path, "images")
 
 
 def _distrust(frames: Int[np.ndarray, "n"], time_ms: Float[np.ndarray, "n"]) -> str | None:
@@ -184,23 +182,11 @@ def _distrust(frames: Int[np.ndarray, "n"], time_ms: Float[np.ndarray, "n"]) -> 
     if np.isnan(time_ms).any():
         return f"{np.isnan(time_ms).sum()} rows have none"
     steps_s = np.diff(time_ms) / 1000.0
-    back = steps_s <= 0.0
-    if back.sum() > max(1.0, _SET_SHARE * len(steps_s)):
-        return f"they do not increase {back.sum()} times, first at frame {frames[1:][back][0]}"
-    # Steps across left-out rows say nothing about the rate.
-    steps_s = steps_s[(np.diff(frames) == 1) & ~back]
+    if (often := goes_back_often(frames, time_ms)) is not None:
+        return f"they {often}"
+    # Steps across left-out rows, and back, say nothing about the rate.
+    steps_s = steps_s[(np.diff(frames) == 1) & (steps_s > 0.0)]
     short = steps_s < _MIN_STEP_S
     if steps_s.size and short.mean() > _SHORT_SHARE:
         return f"{100.0 * short.mean():.0f} % of the steps are shorter than {1000.0 * _MIN_STEP_S:.0f} ms"
     return None
-
-
-def _without_jumps(time_ms: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Put a typical step where the clock stands or goes back; returns the times, and where that is."""
-    steps = np.diff(time_ms)
-    back = steps <= 0.0
-    if not back.any():
-        return time_ms, np.zeros(len(time_ms), dtype=bool)
-    typical = float(np.median(steps[~back])) if (~back).any() else 1000.0 * DEFAULT_PERIOD_S
-    mended = time_ms[0] + np.concatenate([[0.0], np.cumsum(np.where(back, typical, steps))])
-    return mended, np.concatenate([[False], back])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from lanenet.data.drives.recording import DRIVE_FORMAT, drive_file_of, read_drive_file
+from lanenet.data.drives.recording import DRIVE_FORMAT, drive_file_of, named_file, read_drive_file
 from lanenet.data.drives.tub_rows import first_row
 from lanenet.errors import DriveFormatError, counted
 from lanenet.reading import MAX_JSON, FolderFiles, is_regular, natural_key, parsing, read_bytes
@@ -63,9 +63,9 @@ def read_index(path: Path, inside: FolderFiles) -> TubIndex:
     manifest = _read_manifest(inside.file(MANIFEST_FILE, path, DriveFormatError))
     where = path / MANIFEST_FILE
     key = f"{where}: key 'paths'"
-    listed = {name: inside.file(name, key, DriveFormatError) for name in manifest.names}
-    absent = [name for name, file in listed.items() if not is_regular(file)]
-    present = {file: name for name, file in listed.items() if name not in absent}
+    listed = {name: named_file(inside, name, key) for name in manifest.names}
+    absent = [name for name, file in listed.items() if file is None]
+    present = dict.fromkeys(file for file in listed.values() if file is not None)
     # The data decide, not the index; links are checked as those of the manifest are.
     found = [inside.file(file.name, path, DriveFormatError) for file in path.glob(CATALOGS)]
     unlisted = sorted((file for file in found if file not in present and is_regular(file)), key=natural_key)

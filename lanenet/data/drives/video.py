@@ -38,7 +38,8 @@ def read_video(path: Path) -> RecordedFrames:
         problems.append(f"{path}: the video is cut off: {n} of {images.listed_frames} frames can be decoded")
     table = path.with_suffix(".csv")
     if table.is_file() and not is_answers(table):
-        columns, commands = read_times(table)
+        columns, commands, more = read_times(table)
+        problems += more
         frames, t_s, trusted = columns["frame"], columns["t_s"], True
         inside = np.flatnonzero(frames < n)
         if len(inside) == 0:
@@ -57,6 +58,11 @@ def read_video(path: Path) -> RecordedFrames:
                 "beside it with the columns frame and t_s"
             )
         frames = np.arange(n)
+        if trusted and images.t_ms is None and n > 1:
+            trusted = False
+            problems.append(
+                f"{path}: the times of its frames do not increase; taking {fps:g} frames/s as its header says"
+            )
         if trusted and images.t_ms is not None:
             t_s = 0.001 * (images.t_ms - images.t_ms[0])
             steps_ms = np.diff(images.t_ms)
