@@ -29,7 +29,8 @@ _MATRIX = ("cameramatrix", "k", "mtx", "intrinsicmatrix", "intrinsics", "m")
 _DISTORTION = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "dist", "distortion", "d"),
 )
-_SIZE = ("resolution", "imagesize", "imgsize", "size")
+#: The last is that of the usual tutorials of OpenCV's fisheye in Python.
+_SIZE = ("resolution", "imagesize", "imgsize", "size", "dim")
 #: What others call the two lens models that ROS calls plumb_bob and equidistant.
 _MODELS = {
     **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "none", ""), "plumb_bob"),
@@ -61,6 +62,10 @@ def foreign_lens(path: Path) -> ForeignLens | None:
             the image that lanenet does not have.
     """
     text = read_text(path, CalibrationError, _MAX_FILE)
+    if text.startswith("# oST version"):
+        raise CalibrationError(
+            f"{path}: is ROS's ost.txt; give the ost.yaml that camera_calibration wrote beside it"
+        )
     is_storage = text.lstrip().startswith(("<?xml", "<opencv", "%YAML", "{")) or "!!opencv-" in text
     data = _storage(path, text) if is_storage else _first_document(path, text)
     if not isinstance(data, dict) or str(data.get("format", "")).startswith("lanenet") or "mounting" in data:
@@ -83,12 +88,16 @@ def foreign_lens(path: Path) -> ForeignLens | None:
         program = "ROS"
     _refuse_part(path, plain)
     width, height = _size(plain)
+    if width is None or height is None:
+        raise CalibrationError(
+            f"{path}: has no size of the images; add image_width and image_height, in pixels"
+        )
     model = _model(plain)
     distortion = _as_distortion(path, _first(plain, _DISTORTION), model)
     if not {"distortionmodel", "fisheyemodel"} & set(plain) and distortion["cols"] == _FISHEYE_COUNT:
         raise CalibrationError(
             f"{path}: four coefficients are those of a fisheye or of a pinhole, expected the key "
-            "fisheye_model with 1 or 0"
+            "fisheye_model with 1 or 0; add it"
         )
     info = {
         **{"image_width": width, "image_height": height, "distortion_model": model},

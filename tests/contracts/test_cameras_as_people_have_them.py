@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from commands import refused
 from drives import write_drive
 from typer.testing import CliRunner
@@ -83,6 +85,37 @@ image_height: 240
 """
 
 
+#: What camera_calibration writes beside ``ost.yaml``.
+OST = """# oST version 5.0 parameters
+
+
+[image]
+
+width
+320
+
+height
+240
+
+[narrow_stereo]
+
+camera matrix
+322.6 0.0 166.9
+0.0 323.2 121.6
+0.0 0.0 1.0
+
+distortion
+-0.31 0.11 0.0005 -0.0004 -0.02
+"""
+#: As tutorials of OpenCV's fisheye print it, and the key that says what it is.
+FISHEYE = {
+    "DIM": [320, 240],
+    "K": K.tolist(),
+    "D": [[value] for value in D[:4]],
+    "fisheye_model": 1,
+}
+
+
 def echo(model: str = "plumb_bob", rest: str = "", text: str = ECHO) -> str:
     return text.replace("MODEL", model).replace("REST", rest)
 
@@ -126,6 +159,8 @@ def test_a_lens_of_another_program_is_read(tmp_path: Path, name: str) -> None:
             "opencv.yml",
             PYTHON.replace(", -0.02 ]", " ]").replace("rows: 5", "rows: 4") + "fisheye_model: 1\n",
         ),
+        ("fisheye.json", json.dumps(FISHEYE)),
+        ("fisheye.yaml", yaml.safe_dump(FISHEYE)),
     ],
 )
 def test_a_fisheye_of_another_program_is_read(tmp_path: Path, name: str, text: str) -> None:
@@ -196,7 +231,8 @@ BAD = {
     "two cameras": (KALIBR + KALIBR.replace("cam0", "cam1"), "2 cameras (cam0, cam1)"),
     "a stereo pair": (PYTHON.replace("mtx", "M1").replace("dist", "M2"), "stereo pair"),
     "an omnidirectional lens": (KALIBR.replace("pinhole", "omni"), "'distortion_model'"),
-    "no size": (PYTHON.replace("image_size", "points"), "key 'image_width' is missing"),
+    "no size": (PYTHON.replace("image_size", "points"), "add image_width and image_height"),
+    "the text of ROS": (OST, "give the ost.yaml"),
     "four coefficients": (
         PYTHON.replace(", -0.02 ]", " ]").replace("rows: 5", "rows: 4"),
         "key fisheye_model with 1 or 0",
