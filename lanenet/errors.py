@@ -71,6 +71,10 @@ class DriveFormatError(LanenetError):
     """A recorded drive cannot be read."""
 
 
+class UnreadableFrameError(DriveFormatError):
+    """An image of a drive cannot be read; the others may be."""
+
+
 class LibraryError(LanenetError):
     """A library of drives cannot be used, or does not hold a drive as it is asked for."""
 

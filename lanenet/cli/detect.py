@@ -25,7 +25,13 @@ from lanenet.cli.shared.options import (
 from lanenet.cli.shared.standing import next_on_car
 from lanenet.cli.shared.viewing import NO_VIEWS, Views, with_viewers
 from lanenet.config import read_yaml
-from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, counted
+from lanenet.errors import (
+    CalibrationError,
+    DriveFormatError,
+    LanenetError,
+    UnreadableFrameError,
+    counted,
+)
 from lanenet.perception.edges.road import PerceptionSettings
 from lanenet.perception.estimate import DetectorInputs
 from lanenet.perception.registry import (
@@ -243,13 +249,9 @@ def detect_lanes(asked: Asked, views: Views = NO_VIEWS) -> tuple[DetectReport, D
                 skip_unreadable=asked.skip_unreadable,
                 watch=watch,
             )
-        except DriveFormatError as error:
-            way_on = (
-                ""
-                if asked.skip_unreadable
-                else "; --skip-unreadable leaves such frames out, with an empty row"
-            )
-            raise DriveFormatError(f"{error}{way_on}") from None
+        except UnreadableFrameError as error:
+            way_on = "--skip-unreadable leaves such frames out, with an empty row"
+            raise UnreadableFrameError(f"{error}; {way_on}") from None
     return report, chosen
 
 

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from lanenet.data.detections import DetectionTable, check_table_path
 from lanenet.data.drives.sources import Source
 from lanenet.data.files import atomic_file, check_destination
-from lanenet.errors import CalibrationError, DriveFormatError
+from lanenet.errors import CalibrationError, DriveFormatError, UnreadableFrameError
 from lanenet.geometry.camera import Camera
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector, LaneEstimate
@@ -66,7 +66,7 @@ def run_detectors(
         skip_unreadable: Yield a frame that cannot be read with empty estimates.
 
     Raises:
-        DriveFormatError: If a frame cannot be read; names it.
+        UnreadableFrameError: If a frame cannot be read; names it.
         CalibrationError: If a frame does not fit the camera; names it.
     """
     for i in range(len(frames)):
@@ -77,7 +77,7 @@ def run_detectors(
             image = frames.image(i)
         except DriveFormatError as error:
             if not skip_unreadable:
-                raise DriveFormatError(f"{frames.name}: {error}") from None
+                raise UnreadableFrameError(f"{frames.name}: {error}") from None
             yield SeenFrame(i, None, str(error), dict.fromkeys(detectors, LaneEstimate()), {})
             continue
         estimates, seconds = {}, {}

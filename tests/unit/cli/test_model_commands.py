@@ -281,3 +281,12 @@ def test_what_val_suggests_runs(tmp_path: Path, simulation: Path, monkeypatch: p
     for words in (of_network, of_filter, of_other):
         assert run(*words).exit_code == 0, words
         assert read_detections(Path("runs/lanes.csv")).frame.size == 3
+
+
+def test_skipping_is_advised_for_a_frame_that_cannot_be_read_and_for_nothing_else(drive: Path) -> None:
+    words = ("detect", drive, "--detector", "hough", "--out", drive.parent / "l.csv")
+    refused = run(*words, "--video", drive.parent / "folder")
+    assert refused.exit_code == 1 and "ends in one of" in refused.stderr and "--skip" not in refused.stderr
+    (drive / "images" / "000002.jpg").write_bytes(b"torn")
+    refused = run(*words)
+    assert refused.exit_code == 1 and "000002.jpg" in refused.stderr and "--skip-unreadable" in refused.stderr
