@@ -79,13 +79,19 @@ class Section:
 
 def files_on_the_car() -> dict[str, type[BaseModel]]:
     """Return the schemas of the files that the car takes, by the command."""
+    from lanenet.data.drives.recording import DriveFile
     from lanenet.onboard.donkey import DonkeySettings
     from lanenet.onboard.drive import DriveSettings
     from lanenet.perception.registry import KINDS
 
     detectors = {f"detect --detector {name} --config": kind.settings for name, kind in KINDS.items()}
     known = {name: schema for name, schema in detectors.items() if schema is not None}
-    return {"drive": DriveSettings, **known, "In a Donkeycar: lanenet.yaml": DonkeySettings}
+    return {
+        "drive": DriveSettings,
+        **known,
+        "In a Donkeycar: lanenet.yaml": DonkeySettings,
+        "In a recording: drive.yaml": DriveFile,
+    }
 
 
 def files_on_the_workstation() -> dict[str, type[BaseModel]]:
@@ -194,7 +200,7 @@ def _bounds(metadata: list[Any]) -> str:
 
 def shown(value: Any) -> str:
     """Return a default as a file has it, in Markdown's code; empty for none."""
-    if value is None or value is PydanticUndefined:
+    if value is None or value is PydanticUndefined or value == "":
         return ""
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"

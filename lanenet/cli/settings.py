@@ -25,8 +25,8 @@ def settings(
         str | None,
         typer.Argument(
             metavar="[KEY]",
-            help="A key, as control.speed.cruise_cm_s, a section, as learn, or a word of one. Default: all "
-            "keys of a car's file and of a training's config.",
+            help="A key, as control.speed.cruise_cm_s, a section, as learn, a word of one, or drive.yaml. "
+            "Default: all keys of a car's file and of a training's config.",
         ),
     ] = None,
 ) -> None:
@@ -36,22 +36,28 @@ def settings(
         files = {**files_on_the_workstation(), **files}
     except ModuleNotFoundError as error:  # the car
         console.show_problems([f"only the files of the car: {error.name} is not installed"])
-    found, known = False, set[str]()
+    found, known = list[tuple[str, list[str]]](), set[str]()
     for name, schema in files.items():
         if key is None and name not in _FIRST:
             continue
         rows = list(_rows(schema, None if key else set()))
         known |= {word for full, *_ in rows for word in (full, *full.split("."))}
-        for level in _levels(key):
+        levels = [lambda full: True] if name.endswith(f": {key}") else _levels(key)
+        for level in levels:
             chosen = [row for row in rows if level(row[0])]
             if chosen:
-                found = True
-                console.say(name if " " in name else f"lanenet {name} CONFIG [KEY=VALUE]...")
-                for row in chosen:
-                    console.show_lines(_lines(*row, full=key is not None))
+                title = name if " " in name else f"lanenet {name} CONFIG [KEY=VALUE]..."
+                found.append((title, [line for row in chosen for line in _lines(*row, full=key is not None)]))
                 break
     if not found:
         raise ConfigError(f"{key}: no key of any file{did_you_mean(str(key), known)}; see lanenet settings")
+    try:
+        for title, lines in found:
+            console.say(title)
+            console.show_lines(lines)
+    except BrokenPipeError:  # of `lanenet settings | head`, which has read all that it wants
+        with console.told_or_lost():
+            raise
 
 
 def _levels(key: str | None) -> list[Any]:

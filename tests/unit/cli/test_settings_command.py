@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import builtins
+import os
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -43,6 +46,26 @@ def test_without_a_key_a_cars_file_and_a_config_are_said_in_full() -> None:
             key = f"{section.key}.{setting.name}" if section.key else setting.name
             assert setting.nested or f"  {key}" in text, key
     assert "  data.drives.lane_width_cm  number, cm; required" in text and "simulate" not in text
+
+
+def test_the_file_beside_a_recording_is_said() -> None:
+    assert said("topics").startswith("In a recording: drive.yaml\n  topics  list of text")
+    text = said("drive.yaml")
+    assert "\n  notes  text\n" in text
+    assert (
+        "lane_width_cm  number or null, cm" in text
+        and "max_steering_rad" in text
+        and "lanenet drive" not in text
+    )
+
+
+def test_a_reader_that_has_enough_is_no_error() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    words = [sys.executable, "-m", "lanenet", "settings"]
+    done = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True, timeout=100)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_an_unknown_key_is_refused_with_the_nearest() -> None:
