@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,15 @@ def read_tub(path: Path) -> RecordedFrames:
             f"{folder}: {len(missing)} of {len(files)} images are missing (first: frame "
             f"{sequence.frames[missing[0]]}, {sequence.records[missing[0]].image})"
         )
+    # Rows of one name are one by now.
+    named = Counter(file for file in files if file is not None)
+    shared = [k for k, file in enumerate(files) if named[file] > 1]
+    if shared:
+        problems.append(
+            f"{folder}: {len(shared)} of {len(files)} rows name images in several folders that are one file "
+            f"here; left out (first: frame {sequence.frames[shared[0]]}, {sequence.records[shared[0]].image})"
+        )
+        files = [None if named[file] > 1 else file for file in files]
     kept = [k for k, file in enumerate(files) if file is not None]
     images = [file for file in files if file is not None]
     records = [sequence.records[k] for k in kept]

@@ -145,23 +145,22 @@ def _number(value: Any, most: float = math.inf) -> float:
 
 
 def ordered(records: list[Record]) -> Ordered:
-    """Put the rows of a tub in order; rows that repeat an image, or whose index is damaged, are left out.
+    """Put the rows of a tub in order, without those whose image was overwritten or whose index is damaged.
 
-    The index is the order as long as single rows contradict it. Where rows that contradict it count on among
-    themselves, another count began there, as in tubs of tools that count each catalog anew: then the place
-    in the catalogs is the order.
+    An image belongs to the last row that names it, in the place of the first: where a count began again too
+    early, as after a power cut, later images took the names of earlier ones. The index is the order as long
+    as rows contradict it one by one. Two in a row that do so are of another count, as in tubs of tools that
+    count each catalog anew: then the place in the catalogs is the order.
 
     Args:
         records: The rows as they stand in the catalogs.
     """
-    first: dict[str, Record] = {}
-    for record in records:
-        first.setdefault(record.image, record)
-    distinct = list(first.values())
+    # A key of a dict stays where it first was.
+    distinct = list({record.image: record for record in records}.values())
     indexes = [record.index for record in distinct]
     kept = _increasing(indexes)
     lost = sorted(set(range(len(distinct))) - set(kept))
-    recounted = any(b == a + 1 and indexes[b] == indexes[a] + 1 for a, b in itertools.pairwise(lost))
+    recounted = any(b == a + 1 for a, b in itertools.pairwise(lost))
     problems = []
     if recounted:
         steps = np.diff(np.array(indexes, dtype=np.int64))
@@ -174,7 +173,7 @@ def ordered(records: list[Record]) -> Ordered:
         distinct = [distinct[k] for k in kept]
         frames = np.array([record.index for record in distinct], dtype=np.int64)
     if left_out := len(records) - len(distinct):
-        problems.append(f"{left_out} rows repeat an earlier index or go back")
+        problems.append(f"{left_out} rows repeat an index or an image, or go back")
     return Ordered(distinct, frames, recounted, tuple(problems))
 
 

@@ -47,7 +47,44 @@ def test_rows_that_repeat_or_go_back_are_left_out(tmp_path: Path) -> None:
     rows: list[dict[str, Any] | str] = [record(k) for k in (0, 1, 1, 0, 2, 3)]
     drive = open_drive(write_tub(tmp_path / "tub", rows))
     assert drive.frames.tolist() == [0, 1, 2, 3]
-    assert "2 rows repeat an earlier index or go back" in drive.problems[0]
+    assert "2 rows repeat an index or an image, or go back" in drive.problems[0]
+
+
+def test_an_overwritten_image_belongs_to_the_last_row_that_names_it(tmp_path: Path) -> None:
+    """After a power cut, Donkeycar counts on from an old index."""
+    rows: list[dict[str, Any] | str] = [record(k, **{"user/angle": -0.5}) for k in range(10)]
+    late = {"_session_id": "24-01-01_1", "user/angle": 0.5}
+    rows += [record(k, _timestamp_ms=1700000060000 + 50 * k, **late) for k in range(5, 15)]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    assert drive.frames.tolist() == list(range(15))
+    assert drive.commands.angle is not None and drive.commands.angle.tolist() == [-0.5] * 5 + [0.5] * 10
+    assert np.flatnonzero(drive.breaks).tolist() == [5]
+    assert "5 rows repeat" in drive.problems[0]
+
+
+@pytest.mark.parametrize(
+    "indexes", [[0, 2, 4, 6] * 2, [*range(0, 40, 2), *range(1, 40, 2)], [0, 5, 10] * 10, [0] * 8]
+)
+def test_rows_that_are_counted_anew_in_any_steps_stay(tmp_path: Path, indexes: list[int]) -> None:
+    rows: list[dict[str, Any] | str] = [
+        record(k, _index=index, **{"cam/image_array": f"{k}.jpg"}) for k, index in enumerate(indexes)
+    ]
+    drive = open_drive(write_tub(tmp_path / "tub", rows))
+    np.testing.assert_allclose(drive.commands.throttle, 0.01 * np.arange(len(indexes)))
+    assert "'_index' begins anew" in drive.problems[0]
+
+
+@pytest.mark.parametrize("before", ["/home/pi/tub{}/images/", "C:\\car\\tub{}\\images\\"])
+def test_images_of_two_tubs_under_one_name_belong_to_no_row(tmp_path: Path, before: str) -> None:
+    path = write_tub(tmp_path / "tub", [record(k) for k in range(6)])
+    named = [
+        record(k, **{"cam/image_array": before.format(k // 4) + f"{k % 4}_cam_image_array_.jpg"})
+        for k in range(6)
+    ]
+    (path / "catalog_0.catalog").write_text("\n".join(map(json.dumps, named)))
+    drive = open_drive(path)
+    assert drive.frames.tolist() == [2, 3]
+    assert "4 of 6 rows name images in several folders" in drive.problems[0]
 
 
 def test_missing_images_are_counted_and_named(tmp_path: Path) -> None:
