@@ -138,6 +138,39 @@ def test_stamps_go_before_times_of_recording_unless_of_another_clock(tmp_path: P
     )
 
 
+@pytest.mark.parametrize("back_s", [0.3, 5, 40 * 86400])
+def test_a_clock_that_was_set_back_goes_on(tmp_path: Path, back_s: float) -> None:
+    topics = usual(12)
+    back_ns = round(back_s * 10**9)
+    name = "/camera/image_raw/compressed"
+    topics[name][6:] = [(at(k), compressed(frame_image(k), at(k) - back_ns)) for k in range(6, 12)]
+    path = write_bag(tmp_path / "lap", topics)
+    with contextlib.closing(sqlite3.connect(path / "lap.db3")) as database:
+        # As a recorder writes: in the order of arrival, with the time of the clock.
+        later = (back_ns, at(6) - EARLIER_NS)
+        database.execute("UPDATE messages SET timestamp = timestamp - ? WHERE timestamp >= ?", later)
+        database.commit()
+    drive = open_drive(path)
+    np.testing.assert_allclose(drive.t_s, 0.05 * np.arange(12), atol=1e-6)
+    assert "goes back or stands 1 times, first at frame 6" in drive.problems[0] and len(drive.problems) == 1
+    assert drive.commands.speed_cm_s is not None
+    np.testing.assert_allclose(drive.commands.speed_cm_s, 50.0 + 10.0 * np.arange(12), rtol=1e-6)
+    for k in (11, 5, 6, 0):
+        np.testing.assert_array_equal(drive.image(k), frame_image(k))
+
+
+def test_messages_a_little_out_of_order_are_read_in_order(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "lap", {"/camera": usual(12)["/camera/image_raw/compressed"]})
+    with contextlib.closing(sqlite3.connect(path / "lap.db3")) as database:
+        # Rows 5 and 6 change places.
+        database.executescript(
+            "".join(f"UPDATE messages SET id = {b} WHERE id = {a};" for a, b in ((5, 99), (6, 5), (99, 6)))
+        )
+    drive = open_drive(path)
+    np.testing.assert_allclose(drive.t_s, 0.05 * np.arange(12), atol=1e-9)
+    np.testing.assert_array_equal(drive.image(4), frame_image(4))
+
+
 def test_an_image_that_is_not_later_is_left_out_and_said_so(tmp_path: Path) -> None:
     topics = usual(5)
     name = "/camera/image_raw/compressed"

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.drives.bag.messages import COMMAND_TYPES, IMAGE_TYPES, VIDEO_REMEDY, Decoder
-from lanenet.data.drives.bag.storage import METADATA_FILE, STORAGE_ENDINGS, Bag, is_bag
+from lanenet.data.drives.bag.storage import METADATA_FILE, OUT_OF_ORDER, STORAGE_ENDINGS, Bag, is_bag
 from lanenet.data.drives.bag.topic import READABLE, Topic
 from lanenet.data.drives.recording import (
     COMMAND_SPECS,
@@ -222,9 +222,14 @@ def _image_times(bag: Bag, topic: Topic) -> tuple[Int[np.ndarray, "n"], Int[np.n
 
 
 def _times(recorded_ns: list[int], stamps_ns: list[int]) -> Int[np.ndarray, "n"]:
-    """Return the stamps, where they are of the clock of the recording, else the times of recording."""
+    """Return the stamps, where they are of the clock of the recording, else the times of recording.
+
+    Those of a clock that was set back by less are not used, since the times of recording go on there.
+    """
     recorded, stamps = np.array(recorded_ns, np.int64), np.array(stamps_ns, np.int64)
-    return np.where(np.abs(stamps - recorded) <= _SAME_CLOCK_NS, stamps, recorded)
+    times = np.where(np.abs(stamps - recorded) <= _SAME_CLOCK_NS, stamps, recorded)
+    back = -np.diff(times).min(initial=0)
+    return recorded if back > OUT_OF_ORDER * np.median(np.diff(recorded, prepend=recorded[:1])) else times
 
 
 def _commands(bag: Bag, topic: Topic, frames_ns: Int[np.ndarray, "n"]) -> tuple[Commands, list[str]]:

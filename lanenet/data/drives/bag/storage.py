@@ -12,11 +12,16 @@ import weakref
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path, PurePosixPath
 from urllib.parse import quote
 
+import numpy as np
+from jaxtyping import Int
+
 from lanenet.data.drives.bag.mcap_file import open_mcap
 from lanenet.data.drives.bag.topic import MAX_MESSAGE, MAX_STORAGE, Messages, Topic
+from lanenet.data.drives.recording import goes_back_often, without_jumps
 from lanenet.errors import DriveFormatError, LanenetError
 from lanenet.reading import (
     MAX_JSON,
@@ -34,6 +39,9 @@ STORAGE_ENDINGS = (".mcap", ".db3")
 #: A database that was not closed is copied, with its log, up to this size, [B]; chosen: it goes to the folder
 #: of temporary files, which often lies in memory.
 _MAX_COPIED = 2**31
+#: Typical steps that a message of a topic may be behind the one that was written before it. Chosen: threads
+#: swap neighbours.
+OUT_OF_ORDER = 2.0
 
 
 @contextmanager
@@ -62,12 +70,14 @@ class Bag:
             MissingExtraError: If rosbags or mcap is not installed.
         """
         self.path = path
-        #: What is wrong with the bag, a sentence each.
+        #: What is wrong with the bag, a sentence each; some are found when a topic is read.
         self.problems: list[str] = []
         with reading(path), ExitStack() as stack:
             files, self.problems = _storage_files(path)
             opened = [
-                (open_mcap if file.suffix.lower() == ".mcap" else _opened_sqlite)(file, stack)
+                open_mcap(file, stack)
+                if file.suffix.lower() == ".mcap"
+                else _opened_sqlite(file, stack, self.problems)
                 for file in files
             ]
             weakref.finalize(self, stack.pop_all().close)
@@ -157,7 +167,7 @@ def _refuse_packed(path: Path, mode: str) -> None:
     )
 
 
-def _opened_sqlite(path: Path, stack: ExitStack) -> tuple[list[Topic], Messages]:
+def _opened_sqlite(path: Path, stack: ExitStack, problems: list[str]) -> tuple[list[Topic], Messages]:
     with open_regular(path, DriveFormatError, MAX_STORAGE):
         pass
     # Nothing is written beside the file, not even a lock.
@@ -184,16 +194,46 @@ def _opened_sqlite(path: Path, stack: ExitStack) -> tuple[list[Topic], Messages]
     known = {str(name): number for number, name, _, _ in listed}
     topics = [Topic(str(name), str(type_), counts.get(n, 0), str(form)) for n, name, type_, form in listed]
 
+    mended = cache(partial(_set_back, path, database, problems))
+
     def messages(topic: str, from_ns: int | None) -> Iterator[tuple[int, bytes]]:
-        rows = database.execute(
+        number, since = known.get(topic), -(2**63) if from_ns is None else from_ns
+        if (in_order := mended(number)) is not None:
+            rows, times_ns = in_order
+            for k in range(int(np.searchsorted(times_ns, since)), len(rows)):
+                data = database.execute("SELECT data FROM messages WHERE rowid = ?", (int(rows[k]),))
+                yield int(times_ns[k]), data.fetchone()[0]
+            return
+        found = database.execute(
             "SELECT timestamp, data FROM messages WHERE topic_id = ? AND timestamp >= ? ORDER BY timestamp",
-            (known.get(topic), -(2**63) if from_ns is None else from_ns),
+            (number, since),
         )
         # Not `yield from`, which would close the cursor, perhaps after the database.
-        for row in rows:  # noqa: UP028
+        for row in found:  # noqa: UP028
             yield row
 
     return topics, messages
+
+
+def _set_back(
+    path: Path, database: sqlite3.Connection, problems: list[str], topic: int | None
+) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]] | None:
+    """Return a topic's rows as they were written, with times that go on, [ns], if the clock was set back.
+
+    None if it was not: messages that are a little out of order belong where their times are, and so do all
+    where that happens often.
+    """
+    query = "SELECT rowid, timestamp FROM messages WHERE topic_id = ? ORDER BY rowid"
+    rows, times_ns = np.array(database.execute(query, (topic,)).fetchall(), np.int64).reshape(-1, 2).T
+    steps = np.diff(times_ns)
+    if not (steps < 0).any() or -steps.min() <= OUT_OF_ORDER * np.median(np.abs(steps)):
+        return None
+    numbers, t_s = np.arange(len(rows)), (times_ns - times_ns[0]) * 1e-9
+    if goes_back_often(numbers, t_s):
+        return None
+    t_s, found = without_jumps(path, numbers, t_s)
+    problems += found
+    return rows, times_ns[0] + np.round(t_s * 1e9).astype(np.int64)
 
 
 def _log_of(path: Path) -> Path:
