@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -255,9 +256,11 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
         reason = "its report cannot be read"
     page = map_folder / PAGE_NAME
     instead = text_without_map(Path(drive_map.meta.drive), map_folder, drive_map.meta.lane_width_cm)
+    labels = map_folder.with_suffix(".parquet")
+    again = shlex.join(["lanenet", "label", "--force", str(map_folder), "--out", str(labels)])
     # A map without pictures has no page.
     details = page if page.is_file() else map_folder / "report.json"
     raise TrackingLostError(
-        f"{map_folder}: the map was rejected: {reason}; see {details}; lanenet label --force labels it all "
-        f"the same; {instead}"
+        f"{map_folder}: the map was rejected: {reason}; see {details}; to label it all the same: {again}; "
+        f"{instead}"
     )

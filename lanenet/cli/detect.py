@@ -136,7 +136,8 @@ def detect(
         f"{counted(report.frames, 'frame')}, {report.complete} with all six points, {report.steered} with a "
         f"steering target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
     )
-    if hint := getattr(chosen, "hint", ""):
+    hint = getattr(chosen, "hint", "")
+    if hint:
         console.say(f"hint: {hint}")
     console.wrote(report.out, report.video, *views.files)
     if report.video is None:
@@ -158,7 +159,7 @@ def detect(
             "--video": drawn,
         }
         console.next_command("detect", source, *console.given(again))
-    else:
+    elif report.complete and not hint:
         next_on_car()
 
 

@@ -145,4 +145,4 @@ def _export_model(checkpoint: Path, out: Path | None, check: list[Path], int8: b
         path, rasters, difference = export_checkpoint(checkpoint, out, check)
         console.say(f"onnxruntime and PyTorch differ by {difference:.1g} cm at most, on {rasters} rasters")
         console.wrote(path)
-    next_on_car()
+    next_on_car(checkpoint)

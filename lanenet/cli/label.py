@@ -40,7 +40,8 @@ def label(
         report = label_set(one, own, force, colour_weight)
         console.show_lines(report.lines)
     console.wrote(*outs)
-    console.next_command("train", maps[0], "--name", maps[0].resolve().name)
+    # A rejected map is refused there; its labels are not.
+    console.next_command("train", outs[0] if force else maps[0], "--name", maps[0].resolve().name)
 
 
 def label_set(map_folder: Path, out: Path, force: bool, colour_weight: float | None) -> Report:

@@ -523,7 +523,7 @@ class _Run:
 
     def _say_next(self, data: PreparedData) -> None:
         if self.jobs or data.example is None:
-            next_on_car()
+            next_on_car(self.checkpoint)
             return
         camera = self.checkpoint / "camera.yaml" if data.camera is not None else None
         source = self.checkpoint / f"example{data.example.suffix}"

@@ -9,6 +9,7 @@ import typer
 
 from lanenet.cli.shared import console
 from lanenet.cli.shared.options import CameraOption
+from lanenet.cli.shared.standing import look_around, next_on_car, say_next
 from lanenet.errors import ConfigError, LanenetError
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command(epilog="Example: lanenet doctor --config configs/car/picamera_pca9685.yaml")
+@app.command(epilog="Example: lanenet doctor --config checkpoints/mycar/car.yaml")
 def doctor(
     camera: CameraOption = None,
     config: Annotated[Path | None, typer.Option(help="YAML of a car, to check its devices.")] = None,
@@ -63,8 +64,10 @@ def doctor(
     if settings is None or config is None:
         # Without the training packages this is a car.
         trains = any(check.name == "extra train" and check.state == "ok" for check in checks)
-        words = ("train", "configs/small.yaml") if trains else ("doctor", "--config", "CAR.yaml")
-        console.next_command(*words)
+        if trains:
+            say_next(look_around(Path()))
+        else:
+            next_on_car()
     elif settings.actuator is None:
         console.next_command("drive", config, "--dry-run")
     else:

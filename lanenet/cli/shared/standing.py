@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,8 @@ from lanenet.viewers.mcap_file import is_own
 _DEPTH, _MOST_FOLDERS = 3, 1000
 #: Where ``train`` puts the maps that it makes, below the folder of its run.
 _MADE_MAPS = Path("drives") / "maps"
-#: The car's file, as the tutorial has it.
-_CAR = Path("car.yaml")
+#: The car's file, as the tutorial has it, and what it is a copy of.
+_CAR, _TEMPLATE = Path("car.yaml"), Path("configs/car/picamera_pca9685.yaml")
 #: Names of one kind that are listed.
 _MOST_NAMED = 4
 
@@ -90,11 +91,12 @@ def say_standing(folder: Path) -> None:
                 console.show_lines([f"{kind:<12} {', '.join(names[:_MOST_NAMED])}{more}"])
     else:
         console.say("Neither a drive nor a map, a label set or a checkpoint lies in this folder.")
-    _say_next(here)
+    say_next(here)
     console.say("lanenet --help lists all commands; lanenet COMMAND --help shows an example of each")
 
 
-def _say_next(here: Standing) -> None:
+def say_next(here: Standing) -> None:
+    """Print the next step from what lies in a folder to a driving car."""
     trained = {drive: path for path in here.checkpoints for drive in learned_from(path / "run.yaml")}
     mapped = {path.resolve() for path in here.maps.values()}
     tried = {path.resolve(): at for at, path in here.refused.items()}
@@ -103,27 +105,33 @@ def _say_next(here: Standing) -> None:
     if unlearned:
         console.next_command("train", unlearned[0], "--name", unlearned[0].name)
     elif here.maps:
-        next_on_car()
+        next_on_car(trained[next(iter(here.maps.values())).resolve()])
     elif untried := [drive for drive in new if drive.resolve() not in tried]:
         name = untried[0].resolve().stem
-        console.next_command("train", untried[0], "--lane-width", "CM", "--name", name)
+        lengths = ("--lane-width", "CM", "--wheelbase", "CM")
+        console.next_command("train", untried[0], *lengths, "--name", name)
     elif here.refused:
         console.say(f"next: read why there is no map, in {next(iter(here.refused)) / 'report.html'}")
     elif trained:
-        next_on_car()
+        next_on_car(next(iter(trained.values())))
     else:
         console.say(
             "next: copy a drive here (a Donkeycar tub, a folder with frames.csv, or a video), then "
-            "lanenet train DRIVE --lane-width CM --name NAME"
+            "lanenet train DRIVE --lane-width CM --wheelbase CM --name NAME"
         )
 
 
-def next_on_car() -> None:
-    """Print what comes next once there is a network: it drives, or the file of its car is checked."""
+def next_on_car(checkpoint: Path = Path("checkpoints/NAME")) -> None:
+    """Print what comes next once there is a network: a drive, or making and checking the car's file."""
+    own = checkpoint / _CAR
     if _CAR.is_file():
         console.next_command("drive", _CAR, "--dry-run")
+    elif own.is_file():
+        console.next_command("doctor", "--config", own)
     else:
-        console.next_command("doctor", "--config", "CAR.yaml")
+        copied = shlex.join(["cp", str(_TEMPLATE), str(own)])
+        checked = shlex.join(["lanenet", "doctor", "--config", str(own)])
+        console.say(f"next, for the car: {copied}, set its pulses, then {checked}")
 
 
 def _folders(top: Path) -> Iterator[tuple[Path, list[Path]]]:

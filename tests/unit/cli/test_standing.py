@@ -40,7 +40,7 @@ def test_it_goes_with_the_user_from_drive_to_network(here: Path) -> None:
     (here / "mycar" / "data").mkdir(parents=True)
     tub = write_tub(here / "mycar" / "data" / "tub_1", [record(0)])
     assert "drives       mycar/data/tub_1" in said()
-    assert "next: lanenet train mycar/data/tub_1 --lane-width CM --name tub_1" in said()
+    assert "next: lanenet train mycar/data/tub_1 --lane-width CM --wheelbase CM --name tub_1" in said()
     add_map(here / "runs" / "tub_1", tub, verdict="good")
     assert "maps         runs/tub_1" in said()
     assert "next: lanenet train runs/tub_1 --name tub_1" in said()
@@ -54,7 +54,11 @@ def test_it_goes_with_the_user_from_drive_to_network(here: Path) -> None:
     run = {"data": {"drives": [{"path": str(here / "runs" / "tub_1")}]}}
     (here / "checkpoints" / "tub_1" / "run.yaml").write_text(yaml.safe_dump(run))
     # There is a network: what comes next is the car.
-    assert "next: lanenet doctor --config CAR.yaml" in said()
+    own = "checkpoints/tub_1/car.yaml"
+    copied = f"cp configs/car/picamera_pca9685.yaml {own}"
+    assert f"next, for the car: {copied}, set its pulses, then lanenet doctor --config {own}" in said()
+    (here / own).touch()
+    assert f"next: lanenet doctor --config {own}" in said()
     (here / "car.yaml").touch()
     assert "next: lanenet drive car.yaml --dry-run" in said()
     (here / "runs" / "tub_1" / "map.yaml").unlink()
