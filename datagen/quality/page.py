@@ -91,9 +91,9 @@ def report_page(
         *withheld_section(mapped, quality, figures["withheld"]["places"]),
         section("Worst held-out frames") if worst else "",
         note(
-            "Of the frames that had no say in the lines, those whose edges lie furthest from them, in pixels "
-            f"of an image {REFERENCE_WIDTH:g} px wide. If the lines lie on the tape here, too, the map is "
-            f"right. {_LINES_DRAWN}"
+            "Of the frames that were not used for the lines, those whose edges lie furthest from them, in "
+            f"pixels of an image {REFERENCE_WIDTH:g} px wide. If the lines lie on the tape here, too, the "
+            f"map is right. {_LINES_DRAWN}"
         )
         if worst
         else "",

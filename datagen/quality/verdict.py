@@ -220,13 +220,12 @@ class Finding(NamedTuple):
 #: What one check finds; nothing if the map is good.
 _Findings = Iterator[Finding]
 
-#: What helps where the camera may be wrong: known, or found from the drive.
+#: What helps where the camera may be wrong: known, or found from the drive; see :func:`_right_camera`.
 _CHECK_CAMERA = "check that the camera file and the lane width are those of this car and road"
 _LOOP_OR_CAMERA = (
     "drive two laps of a closed road along the same path, or give a camera file or an earlier map of the car "
     "(--camera)"
 )
-_DRIVE_AGAIN = f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
 _RECORD_WHOLE = (
     "the recording has {} pauses, as where it runs only while the throttle is pressed, and what lies in "
     "longer ones is not seen: record all of the drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)"
@@ -272,8 +271,11 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
     withheld = _withheld_text(evidence.withheld)
     if found:
         worst = found[0]
-        more = f" (and {counted(len(found) - 1, 'more finding')})" if len(found) > 1 else ""
-        sentence = f"{worst.cause}{more}: {worst.remedy}"
+        cause = worst.cause
+        if len(found) > 1:
+            are = "is" if len(found) == 2 else "are"
+            cause += f"; {counted(len(found) - 1, 'more finding')} {are} in the report"
+        sentence = f"{cause}. {worst.remedy[:1].upper()}{worst.remedy[1:]}"
         figures = [finding.figures for finding in found]
         figures += [text for text in (withheld, opened) if text]
         return Verdict(worst.grade, sentence, tuple(figures), remarks)
@@ -344,9 +346,9 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
     if any(_other_width(e)):  # a finding, which asks already
         return
     yield (
-        f"is it right that {follows}? Both follow from the lane width of {e.given_lane_cm:g} cm, the one "
-        "thing that sets the scale: if it is wrong, every length is wrong by the same share, and no check "
-        "here can show it; --tape-width or --camera-height, measured with a ruler, would"
+        f"is it right that {follows}? Both follow from the lane width of {e.given_lane_cm:g} cm, which no "
+        "check here can show to be wrong. Measure one of them with a ruler. If it differs, the lane width is "
+        "wrong by the same factor; --camera-height or --tape-width checks it for you"
     )
 
 
@@ -394,6 +396,14 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
+def _right_camera(e: MapEvidence) -> str:
+    """Say what helps where the camera may be wrong, without what was given already."""
+    if e.camera_known:
+        return _CHECK_CAMERA
+    height_known = e.height_given or e.given_height_cm is not None
+    return _LOOP_OR_CAMERA if height_known else f"{_LOOP_OR_CAMERA}, or its height (--camera-height)"
+
+
 def _residuals(e: MapEvidence, s: VerdictSettings) -> _Findings:
     if e.coverage != e.coverage:
         yield Finding(
@@ -403,7 +413,7 @@ def _residuals(e: MapEvidence, s: VerdictSettings) -> _Findings:
             "no frame was held out that shows the lines (held_out_every)",
         )
         return
-    remedy = _CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN
+    remedy = _right_camera(e)
     if not e.coverage > 0.0:
         yield Finding(
             "reject",
@@ -477,8 +487,8 @@ def _labelled(e: MapEvidence, s: VerdictSettings) -> _Findings:
         paused = f"{_RECORD_WHOLE.format(e.pauses)}; or " if e.pauses else ""
         yield Finding(
             grade,
-            f"only {_percent(e.labelled_share)} of the frames have labels (most of the others: {most})",
-            f"{paused}look at the strip of frames in the report, and {_DRIVE_AGAIN}",
+            f"only {_percent(e.labelled_share)} of the frames have labels; most of the others: {most}",
+            f"{paused}look at the strip of frames in the report, and {_right_camera(e)}",
             f"{_percent(e.labelled_share)} of the frames {expected} ({causes}), rejected below "
             f"{_percent(1.0 - s.usable * (1.0 - s.min_labelled))} (min_labelled)",
         )
@@ -526,7 +536,7 @@ def _contradicted(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             grade,
             "in many frames the images disagree with the map",
-            f"look at the worst frames of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
+            f"look at the worst frames of the report; {_right_camera(e)}",
             f"the images disagree with {share} of the frames' lines on the map, "
             f"{_share_at_most('max_contradicted', s.max_contradicted, s)}",
         )
@@ -538,7 +548,7 @@ def _withheld(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             grade,
             "in many places the images disagree with the map",
-            f"look at the withheld places of the report; {_CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN}",
+            f"look at the withheld places of the report; {_right_camera(e)}",
             f"the images disagree with the map along {_percent(e.withheld_share)} of its lines, "
             f"{_share_at_most('max_withheld', s.max_withheld, s)}",
         )
@@ -549,7 +559,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             _bounded(e.closure_across_heights, s.max_closure_heights, s),
             "the laps do not lie on one another",
-            _CHECK_CAMERA if e.camera_known else _DRIVE_AGAIN,
+            _right_camera(e),
             f"median error of revisits across the road: {e.closure_across_heights:.2f} camera heights, "
             f"{_at_most('max_closure_heights', s.max_closure_heights, s)}",
         )
@@ -560,7 +570,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
             "only the camera's height shows what camera this is, for no place was seen twice",
-            _LOOP_OR_CAMERA,
+            _right_camera(e),
             f"the focal length is known to {_percent(sigma)} from the camera's height, expected "
             f"{_percent(s.max_focal_sigma)} at most and a place that is seen twice (max_focal_sigma)",
         )
@@ -569,7 +579,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             max("usable", _bounded(sigma, s.max_focal_sigma, s), key=_ORDER.index),
             "the drive does not show what camera this is, for no place was seen twice",
-            _DRIVE_AGAIN,
+            _right_camera(e),
             f"no place was seen twice, so the focal length is only a guess, here within {_percent(sigma)}, "
             f"expected {_percent(s.max_focal_sigma)} at most (max_focal_sigma)",
         )
@@ -577,7 +587,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             "reject",
             "the drive does not show what camera this is, for hardly any place was seen twice",
-            _DRIVE_AGAIN,
+            _right_camera(e),
             f"the camera was found from {counted(e.revisits, 'place')} seen twice, expected "
             f"{s.min_revisits}: fewer may look alike by chance (min_revisits)",
         )
@@ -585,7 +595,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             _bounded(sigma, s.max_focal_sigma, s),
             "the drive does not show the focal length well enough",
-            _DRIVE_AGAIN,
+            _right_camera(e),
             f"the drive leaves the camera's focal length open by {100.0 * sigma:.1f} %, expected "
             f"{_percent(s.max_focal_sigma)} at most, rejected above {_percent(s.usable * s.max_focal_sigma)} "
             "(max_focal_sigma)",
@@ -594,7 +604,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> _Findings:
         yield Finding(
             _bounded(sigma, s.max_pitch_sigma_rad, s),
             "the drive does not show the camera's pitch well enough",
-            _DRIVE_AGAIN,
+            _right_camera(e),
             f"the drive leaves the camera's pitch open by {sigma:.3f} rad, "
             f"{_at_most('max_pitch_sigma_rad', s.max_pitch_sigma_rad, s, ' rad')}",
         )

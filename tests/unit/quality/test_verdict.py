@@ -225,7 +225,7 @@ def test_bounds(changes, grade, reason):
             *VerdictSettings.model_fields,
             "held_out_every",
         }
-        assert not re.search(r"_|\bpx\b|sigma", verdict.sentence) and ": " in verdict.sentence
+        assert not re.search(r"_|\bpx\b|sigma", verdict.sentence) and ". " in verdict.sentence
 
 
 @pytest.mark.parametrize(
@@ -273,11 +273,19 @@ def test_what_exceeds_a_bound_by_little_does_not_read_like_it():
     assert "expected 7.5 % at most, rejected above 15 %" in reason
 
 
+def test_nobody_is_told_to_give_what_was_given():
+    few = {"labelled_share": 0.8}
+    assert "--camera-height" in graded(GOOD, **few).sentence
+    measured = graded(GOOD, given_height_cm=17.0, height_cm=17.0, **few).sentence
+    assert "--camera)" in measured and "--camera-height" not in measured
+    assert "check that the camera file" in graded(KNOWN, **few).sentence
+
+
 def test_the_sentence_counts_what_it_leaves_to_the_reasons():
     assert "more finding" not in graded(GOOD, p95_px=1.6).sentence
-    assert "(and 1 more finding): " in graded(GOOD, p95_px=1.6, contradicted_share=0.1).sentence
+    assert "; 1 more finding is in the report. " in graded(GOOD, p95_px=1.6, contradicted_share=0.1).sentence
     three = graded(GOOD, p95_px=1.6, contradicted_share=0.1, withheld_share=0.2)
-    assert "(and 2 more findings): " in three.sentence and len(three.reasons) == 3
+    assert "; 2 more findings are in the report. " in three.sentence and len(three.reasons) == 3
 
 
 def test_a_lane_that_widens_in_bends_is_named_and_one_of_many_widths_has_no_scale():
