@@ -172,9 +172,9 @@ def run_detector(
             steered += bool(np.isfinite(estimate.steering_rad))
             table.add(int(source.frames[i]), float(source.t_s[i]), estimate)
             if writer is not None:
-                rate = f"  {1.0 / np.median(times_s[-100:]):.0f} frames/s" if times_s else ""
+                took = f", detector {1e3 * np.median(times_s[-100:]):.1f} ms" if times_s else ""
                 lane = getattr(detector, "last", None) if seen.image is not None else None
-                writer.add(seen.image, estimate, f"{source.frames[i]}{rate}", lane)
+                writer.add(seen.image, estimate, f"frame {source.frames[i]}{took}", lane)
             if watch is not None:
                 watch(seen)
             if progress is not None:

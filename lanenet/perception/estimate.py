@@ -242,7 +242,8 @@ class LaneMemory:
             return ""
         return (
             f"lane width {self.given_cm:g} cm: the lines that are seen lie {seen_cm:.0f} cm apart; measure "
-            "the lane on a straight, between the middles of its two lines"
+            "the lane on a straight, between the middles of its two lines, or the camera file is of another "
+            "car"
         )
 
     def match(self, widths_cm: Float[np.ndarray, "*shape"], sigma: float) -> Float[np.ndarray, "*shape"]:

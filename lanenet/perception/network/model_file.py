@@ -192,7 +192,8 @@ class ModelMeta:
         found = " and ".join(f"{width:g}" for width in others)
         known = f"{low:.0f} cm" if high - low < 1.0 else f"{low:.0f} to {high:.0f} cm"
         return [
-            f"lane width {found} cm: {where} was trained on lanes of {known}; its error on others is unknown"
+            f"lane width {found} cm: {where} was trained on lanes of {known}; on other widths it was not "
+            "tested"
         ]
 
     def to_properties(self) -> dict[str, str]:

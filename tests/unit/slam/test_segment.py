@@ -132,8 +132,8 @@ def test_one_lap_stays_open():
     segment = solver.solve(drive, _camera())
     # Every stage begins at once and ends, so that nobody waits for minutes before a bar that is full.
     follow, adjust = ([step[1:] for step in told if step[0] == name] for name in dict(s[:2] for s in told))
-    assert [s[0] for s in told] == ["follow the drive"] * len(follow) + ["adjust poses"] * len(adjust)
-    assert follow[-1] == (120, 120) and adjust == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert [s[0] for s in told] == ["follow the drive, %"] * len(follow) + ["adjust poses"] * len(adjust)
+    assert follow[-1] == (100, 100) and adjust == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert segment.revisits == [] and segment.drift_rad_per_cm is None
     assert not segment.laps.any()
     np.testing.assert_array_equal(segment.poses, segment.open_poses)
