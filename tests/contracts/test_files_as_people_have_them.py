@@ -551,6 +551,14 @@ def images_as(form: str, data: bytes = b"\0\0\0\1\x67" + bytes(99)) -> Messages:
     return {name: packed, "/drive": usual()["/drive"]}
 
 
+DEPTH = cv2.imencode(".png", np.full((48, 64), 900, np.uint16))[1].tobytes()
+
+
+def depth_beside() -> Messages:
+    name, messages = next(iter(images_as("16UC1; png compressed 16UC1", DEPTH).items()))
+    return {**usual(), f"{name}/depth": messages}
+
+
 def no_metadata(path: Path) -> None:
     (path / "metadata.yaml").unlink()
 
@@ -595,6 +603,11 @@ BAGS = [
     ),
     Case("a video in MCAP", foreign("foxglove.CompressedVideo", "json", "jsonschema"), [], ("republish",)),
     Case("H.264 as an image", bag(topics=images_as("h264")), [], ("'h264'", "JPEG or PNG", "republish")),
+    *(
+        Case(f"depth alone, {form}", bag(topics=images_as(form, DEPTH)), [], ("depths in", "of a camera"))
+        for form in ("16UC1; png compressed 16UC1", "32FC1; tiff")
+    ),
+    Case("depth beside colours", bag(topics=depth_beside()), SIX),
     Case("no image as an image", bag(topics=images_as("jpeg")), [], ("not a readable image",)),
 ]
 

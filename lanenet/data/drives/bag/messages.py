@@ -135,7 +135,7 @@ class Decoder:
         try:
             message = self.message(data)
             if self.topic.type.endswith("CompressedImage"):
-                return "compressedDepth" not in str(message.format)
+                return not _is_depth(str(message.format).lower())
             return message.encoding in _ENCODINGS
         except (DriveFormatError, AttributeError):
             return False
@@ -151,6 +151,11 @@ def _typestore() -> Any:
     return store
 
 
+def _is_depth(form: str) -> bool:
+    """Tell whether the format of a compressed image is that of a depth."""
+    return form.startswith(("16uc1", "32fc1")) or "compresseddepth" in form
+
+
 def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, "h w 3"]:
     """Decode a compressed image.
 
@@ -161,6 +166,8 @@ def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, 
     """
     if named := sorted(_VIDEO_CODECS.intersection(re.split("[^a-z0-9]+", form))):
         raise DriveFormatError(f"{where}: images in {named[0]!r}, expected JPEG or PNG; {VIDEO_REMEDY}")
+    if _is_depth(form):
+        raise DriveFormatError(f"{where}: depths in {form!r}, expected images of a camera")
     # As gray or BGR with 8 bits, whatever is stored: 16 bits with alpha take 8 bytes a pixel.
     image = decode_image(pixels, where, DriveFormatError, cv2.IMREAD_ANYCOLOR)
     if image.ndim == 2:
