@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from datagen.datasets.jobs import Part, RecordedJob
     from lanenet.data.label_set import LabelSet
     from lanenet.evaluation.comparison import SharedErrors
+    from lanenet.evaluation.errors import ErrorStats
     from lanenet.evaluation.robustness import RobustRow
     from lanenet.evaluation.sources import Opened
 
@@ -582,10 +583,13 @@ def split_lines(parts: Mapping[str, LabelSet], how: str, wanted: str) -> list[st
 
     if len(parts) == 1:
         (role,) = parts
-        does = {"train": "learns from", "validation": "chooses the epoch by", "test": "tests on"}[role]
+        does = {"train": "learns from", "validation": "picks the best training state on", "test": "tests on"}[
+            role
+        ]
         return [f"{does} all of it ({said(role)})"]
     lines = [
-        f"learns from {said('train')}; chooses the epoch by {said('validation')}; tests on {said('test')}"
+        f"learns from {said('train')}; picks the best training state on {said('validation')}; tests on "
+        f"{said('test')}"
     ]
     if how != wanted and how == "time":
         lines.append("there are no three complete laps: the drive is split along its time instead of by laps")
@@ -599,16 +603,20 @@ def gain_line(start: str, shared: SharedErrors) -> str:
         start: Name of the one before.
         shared: Its errors and those of the trained one, on the points that both answered.
     """
-    before, after = shared.own, shared.first
-    better = after.rmse_cm < before.rmse_cm and after.median_cm <= before.median_cm
-    worse = after.rmse_cm > before.rmse_cm and after.median_cm >= before.median_cm
+
+    def printed(stats: ErrorStats) -> tuple[float, float]:
+        return round(stats.median_cm, 2), round(stats.rmse_cm, 2)
+
+    (before_cm, before_rmse), (after_cm, after_rmse) = printed(shared.own), printed(shared.first)
+    better = after_rmse < before_rmse and after_cm <= before_cm
+    worse = after_rmse > before_rmse and after_cm >= before_cm
     verdict = "neither is better in both"
     if better or worse:
         verdict = "the training has made it better" if better else "the training has not made it better"
     return (
         f"on the points that both answer, {start}, which it started from, has a median error of "
-        f"{before.median_cm:.2f} cm (RMSE {before.rmse_cm:.2f}), the trained network {after.median_cm:.2f} "
-        f"cm ({after.rmse_cm:.2f}): {verdict}"
+        f"{before_cm:.2f} cm (RMSE {before_rmse:.2f}), the trained network {after_cm:.2f} cm "
+        f"({after_rmse:.2f}): {verdict}"
     )
 
 
