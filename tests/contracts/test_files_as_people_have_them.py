@@ -123,10 +123,23 @@ def stale(path: Path) -> None:
 
 
 def listed_as_text(path: Path) -> None:
-    *lines, last = (path / "manifest.json").read_text().splitlines()
-    about = json.loads(last)
-    about["paths"] = sorted(about["paths"])
-    (path / "manifest.json").write_text("\n".join([*lines, json.dumps(about)]))
+    listing(paths=sorted(file.name for file in path.glob("*.catalog")))(path)
+
+
+def listing(**changes: Any) -> Callable[[Path], None]:
+    """Change the last line of a manifest."""
+
+    def change(path: Path) -> None:
+        *lines, last = (path / "manifest.json").read_text().splitlines()
+        last = json.dumps(json.loads(last) | changes)
+        (path / "manifest.json").write_text("\n".join([*lines, last]))
+
+    return change
+
+
+def with_mark(path: Path) -> None:
+    for catalog in path.glob("*.catalog"):
+        catalog.write_bytes(b"\xef\xbb\xbf" + catalog.read_bytes())
 
 
 def in_windows(path: Path) -> None:
@@ -205,6 +218,22 @@ TUBS = [
     ),
     Case("a manifest of one line less", tub(lambda path: edit_lines(path, -1)), EIGHT, ("five lines",)),
     Case("a manifest without its first lines", tub(lambda path: edit_lines(path, 3)), EIGHT),
+    *(
+        Case(f"deleted frames as {value}", tub(listing(deleted_indexes=value)), EIGHT, words)
+        for value, words in [
+            (None, ("'deleted_indexes' is no list",)),
+            ({"a": 1}, ("'deleted_indexes' is no list",)),
+            (["1"], ()),
+            ([1.0], ()),
+        ]
+    ),
+    Case("catalogs listed as null", tub(listing(paths=None)), EIGHT, ("'paths' is no list",)),
+    Case("catalogs with a byte order mark", tub(with_mark), EIGHT),
+    Case(
+        "a manifest with another name of the camera",
+        tub(lambda path: edit(path / "manifest.json", '"cam/image_array"', '"cam/left"')),
+        EIGHT,
+    ),
     Case(
         "an index with a flipped bit",
         tub(rows=[record(k, _index=k + (2**20 if k == 2 else 0)) for k in range(8)]),
@@ -256,6 +285,12 @@ def edit_lines(path: Path, first: int) -> None:
 @table(TUBS)
 def test_tubs(tmp_path: Path, case: Case) -> None:
     case.check(tmp_path)
+
+
+@pytest.mark.parametrize("value", [["1"], [1.0]])
+def test_deleted_frames_are_whole_numbers_however_written(tmp_path: Path, value: list[Any]) -> None:
+    drive = open_drive(tub(listing(deleted_indexes=value))(tmp_path))
+    assert np.flatnonzero(drive.deleted).tolist() == [1]
 
 
 def test_the_order_of_a_tub_is_that_of_its_catalogs(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ outdates it, while catalogs and images are whole.
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,7 +16,7 @@ from typing import Any
 from lanenet.data.drives.recording import DRIVE_FORMAT, drive_file_of, named_file, read_drive_file
 from lanenet.data.drives.tub_rows import first_row
 from lanenet.errors import DriveFormatError, counted
-from lanenet.reading import MAX_JSON, FolderFiles, is_regular, natural_key, parsing, read_bytes
+from lanenet.reading import MAX_JSON, FolderFiles, is_regular, natural_key, read_bytes
 
 MANIFEST_FILE = "manifest.json"
 #: Names of catalogs that belong to a tub although the manifest does not list them.
@@ -101,17 +102,24 @@ def _read_manifest(path: Path) -> _Manifest:
                 torn.append((number, type(error).__name__))
     catalogs = [value for value in values if isinstance(value, dict) and "paths" in value]
     about = catalogs[-1] if catalogs else {"paths": []}
-    names, deleted = about["paths"], about.get("deleted_indexes", [])
-    with parsing(f"{path}: not a readable tub manifest", DriveFormatError):
-        if not isinstance(deleted, list) or not all(isinstance(index, int) for index in deleted):
-            raise DriveFormatError(f"{path}: expected 'deleted_indexes' to be a list of whole numbers")
-        if not isinstance(names, list):
-            raise DriveFormatError(f"{path}: expected 'paths' to be a list of the catalogs' names")
-        # macOS adds a "._name" beside each file that it copies. Once each: a catalog that is listed a million
-        # times is still one.
-        plain = dict.fromkeys(str(name).replace("\\", "/") for name in names)
-        names = [name for name in plain if not PurePosixPath(name).name.startswith("._")]
     problems = []
+    # Once each: a catalog that is listed a million times is still one.
+    names, deleted = dict[str, None](), set[int]()
+    if isinstance(about["paths"], list):
+        plain = (str(name).replace("\\", "/") for name in about["paths"])
+        # macOS adds a "._name" beside each file that it copies.
+        names = dict.fromkeys(name for name in plain if not PurePosixPath(name).name.startswith("._"))
+    else:
+        problems.append(f"{path}: 'paths' is no list of catalogs; those in the folder are read")
+    listed = about.get("deleted_indexes", [])
+    # Tools write them as texts or with a decimal point, too.
+    indexes = {str(index).removesuffix(".0") for index in listed} if isinstance(listed, list) else {""}
+    if all(re.fullmatch("[0-9]{1,18}", index) for index in indexes):
+        deleted = set(map(int, indexes))
+    else:
+        problems.append(
+            f"{path}: 'deleted_indexes' is no list of whole numbers; which frames were deleted is not known"
+        )
     if not catalogs:
         line = f"line {torn[0][0]} is torn" if torn else "is empty" if not values else "has no torn line"
         problems.append(
@@ -121,7 +129,7 @@ def _read_manifest(path: Path) -> _Manifest:
         )
     elif torn:
         problems.append(f"{path}: line {torn[0][0]} is torn, and left out")
-    return _Manifest(names, set(deleted), _image_keys(values), problems)
+    return _Manifest([*names], deleted, _image_keys(values), problems)
 
 
 def _image_keys(values: list[Any]) -> list[str]:
@@ -140,7 +148,8 @@ def _image_key(path: Path, catalogs: list[Path], known: list[str]) -> str:
         DriveFormatError: If there are several and ``drive.yaml`` does not name one of them.
     """
     row = next((row for row in map(first_row, catalogs) if row), {})
-    keys = known or [
+    # The data decide, not the index.
+    keys = [key for key in known if key in row] or [
         key
         for key, value in row.items()
         if isinstance(value, str) and value.lower().endswith(_IMAGE_ENDINGS) and "depth" not in key

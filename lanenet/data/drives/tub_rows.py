@@ -96,7 +96,7 @@ def first_row(path: Path) -> dict[str, Any]:
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any] | None]]:
     """Yield number and content of each row that is not blank; None for one that is not a JSON object."""
-    text = read_bytes(path, DriveFormatError, _MAX_CATALOG).decode("utf-8", errors="replace")
+    text = read_bytes(path, DriveFormatError, _MAX_CATALOG).decode("utf-8-sig", errors="replace")
     for number, line in enumerate(text.split("\n"), start=1):
         if line and not line.isspace():
             yield number, _parsed(line) if len(line) <= _MAX_ROW else None
