@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,10 @@ def usual(n: int = 6) -> Messages:
     }
 
 
-def write_bag(path: Path, topics: Messages, storage: str = "sqlite3") -> Path:
+def write_bag(
+    path: Path, topics: Messages, storage: str = "sqlite3", clock: Callable[[int], int] = lambda t_ns: t_ns
+) -> Path:
+    """Write messages in their order, with the times of a clock."""
     with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         queue = []
         for topic, messages in topics.items():
@@ -97,7 +101,7 @@ def write_bag(path: Path, topics: Messages, storage: str = "sqlite3") -> Path:
             connection = writer.add_connection(topic, name, typestore=STORE)
             queue += [(t, connection, STORE.serialize_cdr(each, name)) for t, each in messages]
         for t, connection, data in sorted(queue, key=lambda each: each[0]):
-            writer.write(connection, t, data)
+            writer.write(connection, clock(t), data)
     return path
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.drives.bag.messages import COMMAND_TYPES, IMAGE_TYPES, VIDEO_REMEDY, Decoder
-from lanenet.data.drives.bag.storage import METADATA_FILE, OUT_OF_ORDER, STORAGE_ENDINGS, Bag, is_bag
-from lanenet.data.drives.bag.topic import READABLE, Topic
+from lanenet.data.drives.bag.storage import METADATA_FILE, STORAGE_ENDINGS, Bag, is_bag
+from lanenet.data.drives.bag.topic import OUT_OF_ORDER, READABLE, Topic
 from lanenet.data.drives.recording import (
     COMMAND_SPECS,
     DRIVE_FILE,

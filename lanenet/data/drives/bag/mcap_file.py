@@ -13,11 +13,14 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lanenet.data.drives.bag.topic import MAX_MESSAGE, MAX_STORAGE, Messages, Topic
+import numpy as np
+from jaxtyping import Int
+
+from lanenet.data.drives.bag.topic import MAX_MESSAGE, MAX_STORAGE, Messages, Topic, times_going_on
 from lanenet.data.files import require
 from lanenet.errors import DriveFormatError
 from lanenet.reading import MEBIBYTE, open_regular
@@ -37,6 +40,9 @@ _MAX_WAITING = 96 * MEBIBYTE
 _LEAST_PACKED = 2
 #: Messages that any file may hold.
 _ANY_MESSAGES = 100_000
+_TOO_MANY = "has more messages than its size or its index can hold"
+#: Opcode of the index of a channel's messages in a chunk, and what stands before its times and places, [B].
+_INDEX, _INDEX_HEAD = 7, 6
 #: Opcode of a message; opcode and length of a record; channel, sequence, log and publish time of a message.
 _MESSAGE, _RECORD, _HEAD = 5, struct.Struct("<BQ"), struct.Struct("<HIQQ")
 
@@ -54,8 +60,8 @@ class _BoundedReads:
         return self._stream.read(min(length, self._size))
 
 
-def open_mcap(path: Path, stack: ExitStack) -> tuple[list[Topic], Messages]:
-    """Open an MCAP file; returns its topics, and what reads their messages.
+def open_mcap(path: Path, stack: ExitStack, problems: list[str]) -> tuple[list[Topic], Messages]:
+    """Open an MCAP file; returns its topics, and what reads their messages and adds to the problems.
 
     Raises:
         DriveFormatError: If it is no MCAP file, has no index, or stands for more than it may.
@@ -89,7 +95,7 @@ def open_mcap(path: Path, stack: ExitStack) -> tuple[list[Topic], Messages]:
         )
         for channel in summary.channels.values()
     ]
-    return topics, _McapMessages(path, bounded, size, summary)
+    return topics, _McapMessages(path, bounded, size, summary, problems)
 
 
 @dataclass(frozen=True)
@@ -98,17 +104,32 @@ class _McapMessages:
     stream: Any
     size: int
     summary: Any
+    problems: list[str]
+    #: Of topics that were read: messages of each chunk, and their times as written; None: in order of time.
+    known: dict[str, tuple[list[tuple[Any, int]], Int[np.ndarray, "n"]] | None] = field(default_factory=dict)
 
     @property
     def _most(self) -> int:
         """What the chunks may unpack to together, [B]."""
         return _MAX_UNPACKED + _MAX_RATIO * self.size
 
+    @property
+    def _most_messages(self) -> int:
+        return _ANY_MESSAGES + self.size // _LEAST_PACKED
+
     def __call__(self, topic: str, from_ns: int | None) -> Iterator[tuple[int, bytes]]:
-        """Yield time of recording, [ns], and bytes of a topic's messages, in the order of time."""
+        """Yield time of recording, [ns], and bytes of a topic's messages, in the order of time.
+
+        If the clock was set back, in the order in which they were written, with times that go on.
+        """
         channels = {channel.id for channel in self.summary.channels.values() if channel.topic == topic}
         since = 0 if from_ns is None else from_ns
-        left = _ANY_MESSAGES + self.size // _LEAST_PACKED
+        if topic not in self.known:
+            self.known[topic] = self._set_back(channels)
+        if (written := self.known[topic]) is not None:
+            yield from self._as_written(*written, channels, since)
+            return
+        left = self._most_messages
         waiting: list[tuple[int, int, bytes]] = []
         held = order = 0
         for first_ns, records in self._chunks(channels, since):
@@ -119,7 +140,7 @@ class _McapMessages:
             for number, t_ns, content in _messages_in(records):
                 left -= 1
                 if left < 0:
-                    self._refuse("has more messages than its size can hold")
+                    self._refuse(_TOO_MANY)
                 if number in channels and t_ns >= since:
                     heapq.heappush(waiting, (t_ns, order, bytes(content)))
                     order, held = order + 1, held + len(content)
@@ -129,25 +150,76 @@ class _McapMessages:
             t_ns, _, data = heapq.heappop(waiting)
             yield t_ns, data
 
+    def _set_back(self, channels: set[int]) -> tuple[list[tuple[Any, int]], Int[np.ndarray, "n"]] | None:
+        """Return how many of the messages each chunk has, and their times, if the clock was set back.
+
+        The indexes of the chunks say so, which recorders may leave out.
+        """
+        chunks: list[tuple[Any, int]] = []
+        times_ns, left = [np.zeros(0, np.int64)], self._most_messages
+        for chunk in sorted(self.summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+            places = [np.zeros((0, 2), np.int64)]
+            for channel in channels.intersection(chunk.message_index_offsets):
+                self.stream.seek(chunk.message_index_offsets[channel])
+                head = self.stream.read(_RECORD.size + _INDEX_HEAD).ljust(_RECORD.size + _INDEX_HEAD, b"\0")
+                opcode, length = _RECORD.unpack_from(head)
+                count, rest = divmod(length - _INDEX_HEAD, 16)
+                # Damaged: the messages themselves may be whole.
+                if opcode != _INDEX or rest or not 0 <= count <= left:
+                    return None
+                data = self.stream.read(16 * count)
+                if len(data) < 16 * count:
+                    return None
+                places.append(np.frombuffer(data, "<i8").reshape(-1, 2))
+                left -= count
+            found = np.concatenate(places)
+            chunks.append((chunk, len(found)))
+            times_ns.append(found[np.argsort(found[:, 1], kind="stable"), 0])
+        going_on = times_going_on(self.path, np.concatenate(times_ns), self.problems)
+        return None if going_on is None else (chunks, going_on)
+
+    def _as_written(
+        self, chunks: list[tuple[Any, int]], times_ns: Int[np.ndarray, "n"], channels: set[int], since_ns: int
+    ) -> Iterator[tuple[int, bytes]]:
+        """Yield the messages that :meth:`_set_back` counted, with these times, those since a time."""
+        self._check_size()
+        first, end = int(np.searchsorted(times_ns, since_ns)), 0
+        for chunk, count in chunks:
+            k, end = end, end + count
+            if end <= first:
+                continue
+            for number, _, content in _messages_in(self._chunk(chunk)):
+                if number in channels:
+                    if k >= end:
+                        self._refuse(_TOO_MANY)
+                    if k >= first:
+                        yield int(times_ns[k]), bytes(content)
+                    k += 1
+
+    def _check_size(self) -> None:
+        """Refuse chunks that claim too much together: a file may name one chunk any number of times."""
+        if (claimed := sum(index.uncompressed_size for index in self.summary.chunk_indexes)) > self._most:
+            self._refuse_size(claimed, self._most)
+
+    def _chunk(self, index: Any) -> bytes:
+        """Return the unpacked records of a chunk."""
+        stream_of = require("mcap.data_stream", "bags").ReadDataStream
+        self.stream.seek(index.chunk_start_offset + _RECORD.size)
+        chunk = require("mcap.records", "bags").Chunk.read(stream_of(self.stream))
+        return self._unpacked(chunk, index.uncompressed_size)
+
     def _chunks(self, channels: set[int], since_ns: int) -> Iterator[tuple[int, bytes]]:
         """Yield the first time and the unpacked records of each chunk with such channels since a time."""
-        records = require("mcap.records", "bags")
-        stream_of = require("mcap.data_stream", "bags").ReadDataStream
-        most = self._most
         indexes = sorted(self.summary.chunk_indexes, key=lambda index: index.message_start_time)
         if not indexes:
-            yield from self._records_in_order(most)
+            yield from self._records_in_order(self._most)
             return
-        # Before anything is unpacked: a file may name one chunk any number of times.
-        if (claimed := sum(index.uncompressed_size for index in indexes)) > most:
-            self._refuse_size(claimed, most)
+        self._check_size()
         for index in indexes:
             # Recorders may leave out which channels a chunk has.
             has = not index.message_index_offsets or not channels.isdisjoint(index.message_index_offsets)
             if has and index.message_end_time >= since_ns:
-                self.stream.seek(index.chunk_start_offset + _RECORD.size)
-                chunk = records.Chunk.read(stream_of(self.stream))
-                yield index.message_start_time, self._unpacked(chunk, index.uncompressed_size)
+                yield index.message_start_time, self._chunk(index)
 
     def _records_in_order(self, most: int) -> Iterator[tuple[int, bytes]]:
         """Yield the records of a file without an index of chunks; all could be the first in time."""

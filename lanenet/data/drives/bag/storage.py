@@ -20,8 +20,7 @@ import numpy as np
 from jaxtyping import Int
 
 from lanenet.data.drives.bag.mcap_file import open_mcap
-from lanenet.data.drives.bag.topic import MAX_MESSAGE, MAX_STORAGE, Messages, Topic
-from lanenet.data.drives.recording import goes_back_often, without_jumps
+from lanenet.data.drives.bag.topic import MAX_MESSAGE, MAX_STORAGE, Messages, Topic, times_going_on
 from lanenet.errors import DriveFormatError, LanenetError
 from lanenet.reading import (
     MAX_JSON,
@@ -39,9 +38,6 @@ STORAGE_ENDINGS = (".mcap", ".db3")
 #: A database that was not closed is copied, with its log, up to this size, [B]; chosen: it goes to the folder
 #: of temporary files, which often lies in memory.
 _MAX_COPIED = 2**31
-#: Typical steps that a message of a topic may be behind the one that was written before it. Chosen: threads
-#: swap neighbours.
-OUT_OF_ORDER = 2.0
 
 
 @contextmanager
@@ -75,9 +71,7 @@ class Bag:
         with reading(path), ExitStack() as stack:
             files, self.problems = _storage_files(path)
             opened = [
-                open_mcap(file, stack)
-                if file.suffix.lower() == ".mcap"
-                else _opened_sqlite(file, stack, self.problems)
+                (open_mcap if file.suffix.lower() == ".mcap" else _opened_sqlite)(file, stack, self.problems)
                 for file in files
             ]
             weakref.finalize(self, stack.pop_all().close)
@@ -218,22 +212,11 @@ def _opened_sqlite(path: Path, stack: ExitStack, problems: list[str]) -> tuple[l
 def _set_back(
     path: Path, database: sqlite3.Connection, problems: list[str], topic: int | None
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]] | None:
-    """Return a topic's rows as they were written, with times that go on, [ns], if the clock was set back.
-
-    None if it was not: messages that are a little out of order belong where their times are, and so do all
-    where that happens often.
-    """
+    """Return a topic's rows as they were written, with times that go on, [ns], if the clock was set back."""
     query = "SELECT rowid, timestamp FROM messages WHERE topic_id = ? ORDER BY rowid"
     rows, times_ns = np.array(database.execute(query, (topic,)).fetchall(), np.int64).reshape(-1, 2).T
-    steps = np.diff(times_ns)
-    if not (steps < 0).any() or -steps.min() <= OUT_OF_ORDER * np.median(np.abs(steps)):
-        return None
-    numbers, t_s = np.arange(len(rows)), (times_ns - times_ns[0]) * 1e-9
-    if goes_back_often(numbers, t_s):
-        return None
-    t_s, found = without_jumps(path, numbers, t_s)
-    problems += found
-    return rows, times_ns[0] + np.round(t_s * 1e9).astype(np.int64)
+    going_on = times_going_on(path, times_ns, problems)
+    return None if going_on is None else (rows, going_on)
 
 
 def _log_of(path: Path) -> Path:
