@@ -83,6 +83,12 @@ def foreign_lens(path: Path) -> ForeignLens | None:
         raise CalibrationError(f"{path}: holds the cameras of a stereo pair, expected one")
     matrix = _first(plain, _MATRIX)
     if matrix is None:
+        if is_storage or _first(plain, _DISTORTION) is not None:
+            found = ", ".join(map(str, data))[:200]
+            raise CalibrationError(
+                f"{path}: holds no camera matrix under a known name (found {found}); expected image_width, "
+                "image_height, camera_matrix and distortion_coefficients: rename the keys"
+            )
         return None
     if program == "OpenCV" and not is_storage and "distortionmodel" in plain:
         program = "ROS"

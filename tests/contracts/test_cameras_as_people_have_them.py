@@ -232,6 +232,15 @@ BAD = {
     "a stereo pair": (PYTHON.replace("mtx", "M1").replace("dist", "M2"), "stereo pair"),
     "an omnidirectional lens": (KALIBR.replace("pinhole", "omni"), "'distortion_model'"),
     "no size": (PYTHON.replace("image_size", "points"), "add image_width and image_height"),
+    "other names": (PYTHON.replace("mtx", "M1").replace("dist", "D1"), "found M1, D1, image_size); expected"),
+    "other names in XML": (
+        (OPENCV / "opencv.xml").read_text().replace("camera_matrix", "K1").replace("distortion_c", "c"),
+        "K1, coefficients, ",
+    ),
+    "no matrix": (
+        ROS.replace("camera_matrix", "matrix"),
+        "expected image_width, image_height, camera_matrix",
+    ),
     "the text of ROS": (OST, "give the ost.yaml"),
     "four coefficients": (
         PYTHON.replace(", -0.02 ]", " ]").replace("rows: 5", "rows: 4"),
