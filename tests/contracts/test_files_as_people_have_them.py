@@ -438,6 +438,14 @@ def holding(name: str, start: bytes, folder: str = "") -> Make:
 
 TWELVE = list(range(12))
 SPS = b"\0\0\0\1\x67\x42\xc0\x1e"
+CUT = b"\0\0\0\x18ftypisom\0\0\0\1isomavc1\0\0\1\0mdat"
+
+
+def empty_video(folder: Path) -> Path:
+    (folder / "clip.mp4").touch()
+    return folder / "clip.mp4"
+
+
 VIDEOS = [
     Case("a constant rate", video(), TWELVE),
     Case("a constant rate in another container", video(name="clip.mkv"), TWELVE),
@@ -461,6 +469,17 @@ VIDEOS = [
         [],
         ("AV1", "ffmpeg -i", "-c:v libx264 clip_h264.mp4"),
     ),
+    Case(
+        "a video that was cut off",
+        holding("clip.mp4", CUT),
+        [],
+        ("untrunc WHOLE.mp4", "ffmpeg -i"),
+    ),
+    Case("an empty video", empty_video, [], ("is empty",)),
+    Case("an archive as a video", holding("clip.mp4", b"PK\3\4"), [], ("is an archive: unzip",)),
+    Case("a pointer of Git LFS", holding("clip.mp4", b"version https://git-lfs"), [], ("git lfs pull",)),
+    Case("a stream of a server", holding("a.mp4", b"--boundary\r\n"), [], ("-f mpjpeg -i", "a.mjpeg")),
+    Case("no video at all", holding("a.mp4", b"abc"), [], ("begins with b'abc", "ffmpeg -i")),
     Case("another container", holding("clip.ts", b"G"), [], ("ffmpeg -i", "clip.mp4")),
     Case("photos of an iPhone", holding("IMG_1.HEIC", b"\0\0\0\x18ftypheic", "photos"), [], ("IMG_1.jpg",)),
     Case("a bag of ROS 1 that is open", holding("a.bag.active", b"#ROSBAG"), [], ("rosbag reindex",)),

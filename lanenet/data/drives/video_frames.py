@@ -36,6 +36,13 @@ _JPEG = b"\xff\xd8"
 _MPEG = (b"\0\0\1\xba", b"\0\0\1\xb3")
 #: How the containers of the known endings begin; MPEG transport streams have their sign at the first byte.
 _CONTAINERS = (b"\x1aE\xdf\xa3", b"RIFF", *_MPEG, _JPEG, b"G")
+#: What people have under the name of a video, by how it begins, and what to do; ``{file}`` is its path,
+#: ``{new}`` its name without the ending.
+_NO_VIDEOS = {
+    b"PK\3\4": "is an archive: unzip {file}",
+    b"version ": "is a pointer of Git LFS, not the file itself: git lfs pull",
+    b"--": "is a stream of JPEGs as a server sends it: ffmpeg -f mpjpeg -i {file} -c copy {new}.mjpeg",
+}
 _ATOMS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
 
 
@@ -153,7 +160,11 @@ class VideoImages:
         # The full path: a relative one such as "http:/a.mp4" would be taken for an address.
         capture = cv2.VideoCapture(str(self.path.resolve()))
         if not capture.isOpened():
-            raise DriveFormatError(f"{self.path}: not a video that OpenCV can open (or cut off at its end)")
+            raise DriveFormatError(
+                f"{self.path}: not a video that OpenCV can open (or cut off at its end); one that was cut "
+                "off is mended by a whole one of the same camera: untrunc WHOLE.mp4 "
+                f"{shlex.quote(str(self.path))}; others are converted: {_conversion(self.path)}"
+            )
         # Some versions of OpenCV turn frames as the file says, some do not, unless they are told.
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
@@ -213,15 +224,24 @@ def _checked_start(path: Path) -> bytes:
         return start
     if start.startswith((b"\0\0\0\1", b"\0\0\1")):
         raise DriveFormatError(f"{path}: is {raw_stream(path)}")
-    raise DriveFormatError(f"{path}: not a video that OpenCV can open (it begins with {start!r})")
+    if not start:
+        raise DriveFormatError(f"{path}: the file is empty; copy it anew, or record again")
+    for sign, what in _NO_VIDEOS.items():
+        if start.startswith(sign):
+            names = {"file": shlex.quote(str(path)), "new": shlex.quote(path.stem)}
+            raise DriveFormatError(f"{path}: {what.format(**names)}")
+    raise DriveFormatError(
+        f"{path}: not a video that OpenCV can open (it begins with {start!r}); if another program plays it: "
+        f"{_conversion(path)}"
+    )
 
 
 def undecodable(path: Path, codec: str) -> str:
     """Say what to do with a video of which no frame can be decoded."""
-    new = f"{path.stem}_h264.mp4"
     known = {"av01": "AV1", "AV01": "AV1", "hev1": "H.265", "hvc1": "H.265", "vvc1": "H.266"}
     name = known.get(codec, repr(codec))
-    return (
-        f"no frame of the video can be decoded (codec {name}); convert it to H.264: "
-        f"ffmpeg -i {shlex.quote(str(path))} -c:v libx264 {shlex.quote(new)}"
-    )
+    return f"no frame of the video can be decoded (codec {name}); convert it to H.264: {_conversion(path)}"
+
+
+def _conversion(path: Path) -> str:
+    return f"ffmpeg -i {shlex.quote(str(path))} -c:v libx264 {shlex.quote(f'{path.stem}_h264.mp4')}"
