@@ -662,7 +662,11 @@ BAGS = [
         for form in ("16UC1; png compressed 16UC1", "32FC1; tiff")
     ),
     Case("depth beside colours", bag(topics=depth_beside()), SIX),
-    Case("no image as an image", bag(topics=images_as("jpeg")), [], ("not a readable image",)),
+    *(
+        Case(f"H.264 as {form!r}", bag(topics=images_as(form)), [], ("images in H.264 or", "republish"))
+        for form in ("H.264", "avc1", "", "jpeg")
+    ),
+    Case("no image as an image", bag(topics=images_as("jpeg", bytes(99))), [], ("not a readable image",)),
 ]
 
 

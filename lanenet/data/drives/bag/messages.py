@@ -164,8 +164,11 @@ def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, 
         pixels: What was stored: BGR, or RGB taken for BGR, or the mosaic of a Bayer pattern as a gray image.
         where: Names it in errors.
     """
-    if named := sorted(_VIDEO_CODECS.intersection(re.split("[^a-z0-9]+", form))):
-        raise DriveFormatError(f"{where}: images in {named[0]!r}, expected JPEG or PNG; {VIDEO_REMEDY}")
+    named = sorted(_VIDEO_CODECS.intersection(re.split("[^a-z0-9]+", form)))
+    # The start code of H.264 and H.265, for which publishers write any format.
+    if named or pixels.startswith((b"\0\0\0\1", b"\0\0\1")):
+        codec = repr(named[0]) if named else "H.264 or H.265"
+        raise DriveFormatError(f"{where}: images in {codec}, expected JPEG or PNG; {VIDEO_REMEDY}")
     if _is_depth(form):
         raise DriveFormatError(f"{where}: depths in {form!r}, expected images of a camera")
     # As gray or BGR with 8 bits, whatever is stored: 16 bits with alpha take 8 bytes a pixel.
