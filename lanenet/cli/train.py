@@ -309,7 +309,13 @@ class _Run:
             path = job.recording.path
             console.show_lines([f"{path}: has labels already, which are used"])
             lacks = [f"{path}: holds no images, so that there will be no video of what the network sees"]
-            if read_label_index(path).meta.camera is None:
+            meta = read_label_index(path).meta
+            if meta.verdict == "reject":
+                lacks.append(
+                    f"{path}: the map of these labels was rejected: its lines may be wrong, and so may what "
+                    "the network learns and the errors of its test, which is against the same map"
+                )
+            if meta.camera is None:
                 lacks.append(
                     f"{path}: holds no camera (it was written by an earlier version): the checkpoint will "
                     "have no camera.yaml, and the test will be of the network alone, frame by frame, which "
@@ -376,7 +382,7 @@ class _Run:
         from lanenet.data.files import json_text
         from lanenet.data.label_set import read_places
         from lanenet.evaluation.answers import Compared
-        from lanenet.evaluation.card import CARD_NAME, model_card
+        from lanenet.evaluation.card import CARD_NAME, model_card, of_rejected_maps
         from lanenet.evaluation.comparison import default_names, evaluate
         from lanenet.evaluation.model_page import model_page
         from lanenet.evaluation.report import report_files
@@ -413,16 +419,19 @@ class _Run:
         val_cli.show(comparison, seen, where, ["network", *start], self._show_all)
         console.show_lines([gain_line(name, comparison.shared[name]) for name in start])
         robustness = _robustness(model, sources)
+        tests = [source.labels for source in sources if source.labels is not None]
         card = model_card(
             settings.name,
             read_model_meta(model),
             read_json(run_folder / METRICS_NAME, CheckpointError),
             training,
-            [source.labels for source in sources if source.labels is not None],
+            tests,
             comparison,
             robustness,
         )
-        page = model_page(f"How good {settings.name} is", comparison, seen, where)
+        page = model_page(
+            f"How good {settings.name} is", comparison, seen, where, of_rejected_maps([*training, *tests])
+        )
         files: dict[str, str | bytes] = {
             "run.yaml": dump_settings(settings),
             CARD_NAME: card,

@@ -59,6 +59,7 @@ GROUP_ROWS = 256
 #: A row takes at least so many bytes of the file. Measured: rows of a car that stands take 35.
 _LEAST_PACKED = 16
 Source = Literal["map", "truth"]
+Grade = Literal["good", "usable", "reject"]
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ class LabelMeta:
         config_hash: Hash of the settings that made the labels; empty if unknown.
         camera_cm: Optical centre right of, ahead of and above the front axle; None if unknown.
         camera: Camera of the edge points; None in label sets of format 2.
+        verdict: On the map that the labels are from; None if unknown, as in older label sets.
     """
 
     window: BirdseyeWindow
@@ -89,6 +91,7 @@ class LabelMeta:
     camera_cm: tuple[float, float, float] | None = None
     # Compared by its hash.
     camera: Camera | None = field(default=None, compare=False)
+    verdict: Grade | None = None
 
 
 _EDGE_COLUMNS = (
@@ -358,6 +361,7 @@ class _MetaFile(Settings):
     config_hash: str
     camera_cm: tuple[float, float, float] | None
     camera: CameraFile | None = None
+    verdict: Grade | None = None
 
 
 def _meta_to_file(meta: LabelMeta, where: str) -> dict[str, Any]:

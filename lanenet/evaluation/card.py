@@ -44,15 +44,32 @@ def model_card(
         comparison: Its errors on the test drives; the network is the first detector.
         robustness: Its errors when something is wrong; may be empty.
     """
+    rejected = of_rejected_maps([*training, *tests])
     parts = [
         f"# {name}\n\n{_what(meta, metrics)}",
+        f"**{rejected}**" if rejected else "",
         f"## What it was trained on\n\n{_training(meta, metrics, training)}",
         f"## How good it is\n\n{_errors(comparison)}{_one_recording(training, tests)}",
         f"## Where it fails\n\n{_failures(meta, comparison)}",
     ]
     if robustness:
         parts.append("## " + robust_table(robustness).as_markdown())
-    return "\n\n".join(part.rstrip() for part in parts) + "\n"
+    return "\n\n".join(part.rstrip() for part in parts if part) + "\n"
+
+
+def of_rejected_maps(labels: Sequence[LabelSet]) -> str:
+    """Say which drives have labels of a map that was rejected; empty if none has.
+
+    Args:
+        labels: What was learned from and tested on.
+    """
+    drives = sorted({name for one in labels if one.meta.verdict == "reject" for name in one.drive})
+    if not drives:
+        return ""
+    return (
+        f"The map of {', '.join(drives)} was rejected, and labelled all the same (lanenet label --force): "
+        "its lines may be wrong, in what was learned and in the errors that are given here."
+    )
 
 
 def _what(meta: ModelMeta, metrics: Mapping[str, Any]) -> str:

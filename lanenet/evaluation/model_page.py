@@ -41,7 +41,9 @@ _PICTURES, _SOURCES = 8, 3
 _COLOURS = "Magenta: the lines by the {reference}; green and orange: left and right line of the answer."
 
 
-def model_page(name: str, comparison: Comparison, seen: Sequence[SeenSource], where: str) -> str:
+def model_page(
+    name: str, comparison: Comparison, seen: Sequence[SeenSource], where: str, doubt: str = ""
+) -> str:
     """Write the report of a model, or of another detector, as HTML.
 
     Args:
@@ -49,6 +51,7 @@ def model_page(name: str, comparison: Comparison, seen: Sequence[SeenSource], wh
         comparison: The figures; the detector that the page is about is the first.
         seen: Its answers on the sources that have frames.
         where: On what it was measured, as for :func:`verdict_sentence`.
+        doubt: What to know before the figures; may be empty.
 
     Raises:
         DriveFormatError: If a frame that it shows cannot be read.
@@ -60,6 +63,7 @@ def model_page(name: str, comparison: Comparison, seen: Sequence[SeenSource], wh
     names = [Path(source.name).name for source in comparison.sources]
     sources = ", ".join(names) if len(names) <= _SOURCES else f"{len(names)} drives"
     body = [
+        note(doubt) if doubt else "",
         table(point_rows(comparison)),
         note(
             f"Errors in cm against the {reference}, on {frames} of {sources}, by line and distance ahead of "

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from small_map import small_map
 from synthetic_labels import make_label_set
 from typer.testing import CliRunner
 
+from datagen.datasets.jobs import RecordedJob
+from datagen.datasets.settings import DataSettings, RecordedSettings
 from datagen.made import Output
 from datagen.pipeline import MapRequest, map_key
 from datagen.settings import MapSettings
@@ -31,7 +34,7 @@ from lanenet.cli.shared.own_drive import (
     sources_in,
 )
 from lanenet.cli.shared.stages import Stages, stopped_in
-from lanenet.cli.train import expected_s, gain_line, run_settings_schema
+from lanenet.cli.train import _Run, expected_s, gain_line, run_settings_schema
 from lanenet.config import apply_overrides, check_settings
 from lanenet.data.drives import open_drive
 from lanenet.data.label_set import write_labels
@@ -321,6 +324,17 @@ def test_a_finished_map_takes_no_time(here: Path) -> None:
     assert stages["map"]["map"] == 0.0 < stages["drive"]["map"]
     simulated = settings_of({"name": "a", "data": {"synthetic": {"train": 1, "validation": 1}}})
     assert not any(expected_s(simulated, []).values()) and "map" not in expected_s(simulated, [])
+
+
+def test_labels_of_a_rejected_map_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for verdict in ("usable", "reject"):
+        labels = make_label_set(4, 0)
+        path = tmp_path / f"{verdict}.parquet"
+        write_labels(path, replace(labels, meta=replace(labels.meta, verdict=verdict)))
+        job = RecordedJob(RecordedSettings(path=path, lane_width_cm=40.0), DataSettings(), tmp_path)
+        _Run._map(cast(_Run, None), job)
+        said = capsys.readouterr().err.count(f"{path}: the map of these labels was rejected")
+        assert said == (verdict == "reject")
 
 
 def test_the_config_of_another_drives_run_is_not_written_over(tmp_path: Path) -> None:

@@ -177,6 +177,19 @@ def test_other_tools_see_nulls_units_and_an_image(tmp_path: Path) -> None:
     assert (meta["camera_hash"], meta["source"], meta["config_hash"]) == ("0123456789abcdef", "truth", "feed")
 
 
+def test_the_verdict_on_the_map_is_kept_and_older_files_have_none(tmp_path: Path) -> None:
+    labels = make_labels()
+    rejected = replace(labels, meta=replace(META, source="map", verdict="reject"))
+    path = tmp_path / "labels.parquet"
+    write_labels(path, rejected)
+    assert_same(read_labels(path), rejected)
+    table = pq.read_table(path)
+    meta = json.loads(table.schema.metadata[b"lanenet"])
+    del meta["verdict"]
+    pq.write_table(table.replace_schema_metadata({"lanenet": json.dumps(meta)}), path)
+    assert read_label_index(path).meta.verdict is None
+
+
 def test_several_row_groups_read_as_one(tmp_path: Path) -> None:
     labels = make_labels(9)
     path = tmp_path / "labels.parquet"

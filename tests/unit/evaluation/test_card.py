@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 from synthetic_labels import make_label_set
 
@@ -10,12 +12,13 @@ TRUTH = np.tile([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0], (50, 1))
 METRICS = {"parameters": 97310, "epochs": 8, "best_epoch": 7, "val_frames": 12, "val_rmse_cm": 0.5}
 
 
-def card(*errors_cm, meta=None, conditions=None, tests=()):
+def card(*errors_cm, meta=None, conditions=None, tests=(), verdict=None):
     answers = [
         SourceAnswers(f"d/t{k}", "map", "map", TRUTH, {"n": TRUTH + e}, conditions=conditions or {})
         for k, e in enumerate(errors_cm)
     ]
     training = [make_label_set(4, 0), make_label_set(5, 1, camera_hash="cam1")]
+    training = [replace(one, meta=replace(one.meta, verdict=verdict)) for one in training]
     meta = meta or model_meta()
     return model_card("mine", meta, METRICS, training, tests, compare_detectors(answers), [])
 
@@ -48,6 +51,12 @@ def test_a_test_on_the_map_that_was_learned_from_is_owned_up_to():
     assert "Test and training are parts of one recording" in card(1.0, tests=[same])
     assert "1 of the 2 tests and training are parts" in card(1.0, tests=[same, other])
     assert "one recording" not in card(1.0, tests=[other, truth])
+
+
+def test_labels_of_a_rejected_map_are_owned_up_to_at_the_top():
+    text = card(1.0, verdict="reject")
+    assert "was rejected, and labelled all the same" in text[: text.index("## ")]
+    assert "rejected" not in card(1.0, verdict="usable")
 
 
 def test_weak_spots_are_named_the_worst_drive_first():
