@@ -19,7 +19,7 @@ from datagen.quality.figures import Report
 from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
 from datagen.quality.verdict import verdict_lines
-from datagen.quality.without_map import text_without_map
+from datagen.quality.without_map import hints_without_map
 from datagen.refusal import Attempt, report_refusal
 from datagen.rescale import Solved, rescaled
 from datagen.segments import camera_of_drive, fit_lanes, solve_drive
@@ -80,11 +80,14 @@ def map_drive(
             return _map_drive(attempt, map_key(request, settings), out, progress, pictures, like)
         except (CalibrationError, DriveFormatError) as error:
             page = _refused(attempt, error, out) if pictures else ""
-            raise type(error)(f"{error}{kept_map(out)}{page}") from error
+            hints = _hints(attempt, out) if page else ()
+            raise type(error)(f"{error}{kept_map(out)}{page}", hints=hints) from error
         except TrackingLostError as error:
             where = "" if str(request.drive_path) in str(error) else f"{request.drive_path}: "
             page = _refused(attempt, error, out) if pictures else ""
-            raise TrackingLostError(f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}{page}") from error
+            hints = _hints(attempt, out) if page else ()
+            message = f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}{page}"
+            raise TrackingLostError(message, hints=hints) from error
 
 
 def map_key(request: MapRequest, settings: MapSettings) -> str:
@@ -100,14 +103,17 @@ def map_key(request: MapRequest, settings: MapSettings) -> str:
 
 
 def _refused(attempt: Attempt, error: LanenetError, out: Path) -> str:
-    """Write the report of a refusal, and say where it is and what to do without: the end of a sentence."""
-    instead = f"; {text_without_map(attempt.request.drive_path, out, None)}"
+    """Write the report of a refusal, and say where it is, if there is anything: the end of a sentence."""
     try:
-        return f"; see {report_refusal(attempt, error, out)}{instead}"
+        return f"; see {report_refusal(attempt, error, out)}"
     except DriveFormatError:  # there is nothing to show
         return ""
     except LanenetError as failed:  # what was refused is worse
-        return f"; its report could not be written ({failed}){instead}"
+        return f"; its report could not be written ({failed})"
+
+
+def _hints(attempt: Attempt, out: Path) -> list[str]:
+    return hints_without_map(attempt.request.drive_path, out, None)
 
 
 def _map_drive(

@@ -19,7 +19,7 @@ A message names what was found, what was expected and where (file, key, frame).
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 def did_you_mean(name: str, known: Iterable[str], least: float = 0.6) -> str:
@@ -54,9 +54,14 @@ class LanenetError(Exception):
 
     Attributes:
         exit_code: Of the command that ends with the error.
+        hints: Shown below it, a line each: what to look at, and commands to be copied.
     """
 
     exit_code = 1
+
+    def __init__(self, *message: object, hints: Sequence[str] = ()) -> None:
+        super().__init__(*message)
+        self.hints = tuple(hints)
 
 
 class ConfigError(LanenetError):

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from datagen.quality.figures import Report
 from datagen.quality.pictures import draw_contact_sheet
-from datagen.quality.without_map import text_without_map
+from datagen.quality.without_map import hints_without_map
 from datagen.slam.odometry.scans import Progress
 from lanenet.data.files import atomic_file, write_json
 from lanenet.data.label_set import LabelMeta, LabelSet, write_labels
@@ -118,6 +118,7 @@ def label_map(
             marking_cm=drive_map.meta.tape_cm,
             camera_cm=drive_map.camera.mounting.at_cm,
             camera=drive_map.camera,
+            verdict=drive_map.meta.verdict,
         ),
         drive=[mapped.drive.name if name is None else name] * len(rows),
         file=[""] * len(rows),
@@ -255,12 +256,12 @@ def refuse_rejected(map_folder: Path, drive_map: DriveMap) -> None:
     except MapFormatError:  # the verdict stands without its reasons
         reason = "its report cannot be read"
     page = map_folder / PAGE_NAME
-    instead = text_without_map(Path(drive_map.meta.drive), map_folder, drive_map.meta.lane_width_cm)
+    instead = hints_without_map(Path(drive_map.meta.drive), map_folder, drive_map.meta.lane_width_cm)
     labels = map_folder.with_suffix(".parquet")
     again = shlex.join(["lanenet", "label", "--force", str(map_folder), "--out", str(labels)])
     # A map without pictures has no page.
     details = page if page.is_file() else map_folder / "report.json"
     raise TrackingLostError(
-        f"{map_folder}: the map was rejected: {reason}; see {details}; to label it all the same: {again}; "
-        f"{instead}"
+        f"{map_folder}: the map was rejected: {reason}; see {details}",
+        hints=[f"to label it all the same: {again}", *instead],
     )

@@ -32,6 +32,6 @@ def commands_without_map(drive: Path, out: Path, lane_width_cm: float | None) ->
     return found
 
 
-def text_without_map(drive: Path, out: Path, lane_width_cm: float | None) -> str:
-    """Return :func:`commands_without_map` as the end of a message."""
-    return "; ".join(f"{what}: {line}" for what, line in commands_without_map(drive, out, lane_width_cm))
+def hints_without_map(drive: Path, out: Path, lane_width_cm: float | None) -> list[str]:
+    """Return :func:`commands_without_map` as lines below an error."""
+    return [f"{what}: {line}" for what, line in commands_without_map(drive, out, lane_width_cm)]

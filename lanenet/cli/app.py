@@ -69,6 +69,7 @@ class _Group(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         code = LanenetError.exit_code
+        hints: tuple[str, ...] = ()
         try:
             with held_to_the_end():
                 answer = super().invoke(ctx)
@@ -79,6 +80,7 @@ class _Group(TyperGroup):
             _refuse_usage(error)
         except (LanenetError, OSError) as error:
             message, code = str(error), getattr(error, "exit_code", code)
+            hints = getattr(error, "hints", ())
         except MemoryError as error:
             message = f"out of memory{f' ({error})' if str(error) else ''}"
         except ModuleNotFoundError as error:
@@ -92,9 +94,10 @@ class _Group(TyperGroup):
         except KeyboardInterrupt:
             typer.echo("interrupted", err=True)
             raise SystemExit(130) from None
-        # One line: a name may hold a line feed, too.
         with console.told_or_lost():
-            console.say("error: " + message.replace("\n", "\\n"), err=True)
+            for line in (f"error: {message}", *(f"  {hint}" for hint in hints)):
+                # A name may hold a line feed, too.
+                console.say(line.replace("\n", "\\n"), err=True)
         raise SystemExit(code)
 
 

@@ -53,7 +53,7 @@ def map_drive(
     from datagen.pipeline import MapRequest, MapSettings
     from datagen.pipeline import map_drive as run
     from datagen.quality.verdict import folded
-    from datagen.quality.without_map import text_without_map
+    from datagen.quality.without_map import hints_without_map
 
     settings = MapSettings() if config is None else load_settings(MapSettings, config)
     views.check(drive)
@@ -72,8 +72,8 @@ def map_drive(
     console.wrote(out, page, *views.files)
     if report.figures["verdict"]["grade"] == "reject":
         raise LanenetError(
-            f"{out}: the map was rejected: it is kept for inspection, but gives no labels; "
-            f"{text_without_map(drive, out, lane_width)}"
+            f"{out}: the map was rejected: it is kept for inspection, but gives no labels",
+            hints=hints_without_map(drive, out, lane_width),
         )
     console.next_command("label", out, "--out", out.with_suffix(".parquet"))
 

@@ -64,7 +64,7 @@ def test_detect_writes_table_and_video_and_says_so(tmp_path: Path, photos: Path)
     assert result.exit_code == 0, result.output
     assert np.isfinite(read_detections(out).points_cm).all()
     assert video.stat().st_size > 0
-    for text in ("3 frames, 3 with all six points", f"wrote {out}", f"wrote {video}", "next: lanenet "):
+    for text in ("3 frames, 3 with all six points", f"wrote {out}", f"wrote {video}", "next, for the car: "):
         assert text in result.stdout
 
 
@@ -300,12 +300,12 @@ def test_a_rejected_map_is_written_and_an_error(asked: Asked) -> None:
     assert "verdict: reject" in result.stdout and "wrote m/report.html" in result.stdout
     assert "next:" not in result.stdout
     # What finds lines all the same, to be copied: one needs no camera, the other takes that of this map.
-    error = error_of(result)
-    assert "lanenet detect tub --detector hough --out m-hough.csv --video m-hough.mp4" in error
-    assert (
-        "lanenet detect tub --model checkpoints/general --camera m --lane-width 40 --out m-network" in error
+    hints = [line for line in result.stderr.splitlines() if line.startswith("  to try ")]
+    assert hints[0].endswith(": lanenet detect tub --detector hough --out m-hough.csv --video m-hough.mp4")
+    assert "doubtful as the map" in hints[1] and (
+        ": lanenet detect tub --model checkpoints/general --camera m --lane-width 40 --out m-network"
+        in hints[1]
     )
-    assert "doubtful as the map" in error
 
 
 def test_map_shows_three_lines_below_the_verdict_and_says_where_the_others_are(asked: Asked) -> None:
