@@ -605,6 +605,22 @@ def images_as(form: str, data: bytes = b"\0\0\0\1\x67" + bytes(99)) -> Messages:
     return {name: packed, "/drive": usual()["/drive"]}
 
 
+def listed_as_packed(path: Path) -> None:
+    """As after ``zstd -d`` of the file that the metadata list; of a bag in parts, a second one is packed."""
+    text = (path / "metadata.yaml").read_text().replace("compression_mode: ''", "compression_mode: FILE")
+    for ending in ("mcap", "db3"):
+        text = text.replace(f".{ending}\n", f".{ending}.zstd\n")
+    if (path / "lap_1.db3").exists():
+        text = text.replace("- lap_0.db3.zstd\n", "- lap_0.db3.zstd\n  - lap_1.db3.zstd\n")
+        (path / "lap_1.db3").rename(path / "lap_1.db3.zstd")
+    (path / "metadata.yaml").write_text(text)
+
+
+def renamed(path: Path, name: str) -> None:
+    (path / "metadata.yaml").unlink()
+    next(path.iterdir()).rename(path / name)
+
+
 DEPTH = cv2.imencode(".png", np.full((48, 64), 900, np.uint16))[1].tobytes()
 
 
@@ -618,10 +634,21 @@ def no_metadata(path: Path) -> None:
 
 
 SIX, ELEVEN = list(range(6)), list(range(11))
+NO_FILE = ("metadata.yaml: names no file",)
 UNPACKED = ("compression_mode: ''", "compression_mode: NONE")
 BAGS = [
     Case("unpacked by hand", bag(lambda path: edit(path / "metadata.yaml", *UNPACKED)), SIX),
-    Case("no metadata", bag(no_metadata), SIX, ("metadata.yaml: names no file",)),
+    Case("unpacked by hand, with metadata of the packed one", bag(listed_as_packed), SIX),
+    Case("half of it unpacked by hand", split(listed_as_packed), [], ("mode file", "rosbags-convert")),
+    Case("MCAP named SQLite", bag(lambda path: renamed(path, "lap.db3")), SIX, NO_FILE),
+    Case("SQLite named MCAP", bag(lambda path: renamed(path, "lap.mcap"), "sqlite3"), SIX, NO_FILE),
+    Case(
+        "ROS 1 named SQLite",
+        holding("a.db3", b"#ROSBAG V2.0\n"),
+        [],
+        ("ROS 1", "a.db3 a.bag; rosbags-convert --src a.bag --dst a"),
+    ),
+    Case("no metadata", bag(no_metadata), SIX, NO_FILE),
     Case("no metadata, in parts", split(no_metadata), ELEVEN, ("names no file",)),
     Case(
         "empty metadata", bag(lambda path: (path / "metadata.yaml").write_bytes(b"")), SIX, ("names no file",)

@@ -70,10 +70,7 @@ class Bag:
         self.problems: list[str] = []
         with reading(path), ExitStack() as stack:
             files, self.problems = _storage_files(path)
-            opened = [
-                (open_mcap if file.suffix.lower() == ".mcap" else _opened_sqlite)(file, stack, self.problems)
-                for file in files
-            ]
+            opened = [_opened(file, stack, self.problems) for file in files]
             weakref.finalize(self, stack.pop_all().close)
         self._messages = [messages for _, messages in opened]
         found: dict[str, Topic] = {}
@@ -130,8 +127,12 @@ def _storage_files(path: Path) -> tuple[list[Path], list[str]]:
     listed = re.findall(r"- [\"']?([^\"'\n]+)", block[1] if block else "")
     names = [PurePosixPath(name.strip().replace("\\", "/")).name for name in listed]
     there = sorted((file.name for file in path.glob("*") if is_regular(file)), key=natural_key)
-    if mode and mode[1].lower() not in ("", "none"):
-        _refuse_packed(path, mode[1])
+    packed = mode[1].lower() if mode else ""
+    if packed == "file":
+        # They may have been unpacked since.
+        names = [re.sub(r"\.(zstd|zst|lz4)$", "", name) for name in names]
+    if packed not in ("", "none") and (packed != "file" or not {*names} <= {*there}):
+        _refuse_packed(path, packed)
     files = [name for name in there if name.lower().endswith(STORAGE_ENDINGS) and not name.startswith(".")]
     if not files and any(name.endswith((".zstd", ".zst", ".lz4")) for name in there):
         _refuse_packed(path, "file")
@@ -161,9 +162,22 @@ def _refuse_packed(path: Path, mode: str) -> None:
     )
 
 
+def _opened(path: Path, stack: ExitStack, problems: list[str]) -> tuple[list[Topic], Messages]:
+    """Open a storage file as what it is, whatever its ending."""
+    with open_regular(path, DriveFormatError, MAX_STORAGE) as stream:
+        start = stream.read(7)
+    if start == b"#ROSBAG":
+        bag = shlex.quote(f"{path.stem}.bag")
+        raise DriveFormatError(
+            f"{path}: is a bag of ROS 1, which has to be converted first: cp {shlex.quote(str(path))} {bag}; "
+            f"rosbags-convert --src {bag} --dst {shlex.quote(path.stem)}"
+        )
+    if start.startswith(b"\x89MCAP") or (path.suffix.lower() == ".mcap" and start != b"SQLite "):
+        return open_mcap(path, stack, problems)
+    return _opened_sqlite(path, stack, problems)
+
+
 def _opened_sqlite(path: Path, stack: ExitStack, problems: list[str]) -> tuple[list[Topic], Messages]:
-    with open_regular(path, DriveFormatError, MAX_STORAGE):
-        pass
     # Nothing is written beside the file, not even a lock.
     whole = _whole_database(path, stack)
     address = f"file:{quote(str(whole.resolve()))}?mode=ro{'&immutable=1' if whole == path else ''}"
