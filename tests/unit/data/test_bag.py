@@ -5,6 +5,7 @@ import pickle
 import shutil
 import sqlite3
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -218,6 +219,23 @@ def test_raw_images_of_each_encoding(tmp_path: Path, encoding: str) -> None:
     assert "no topic of commands, expected ackermann_msgs" in drive.problems[0]
 
 
+@pytest.mark.parametrize("encoding", [f"{name}16" for name in ("mono", "rgb", "bgra", "bayer_rggb")])
+@pytest.mark.parametrize("big", [False, True])
+def test_of_16_bits_the_upper_ones_are_read(tmp_path: Path, encoding: str, big: bool) -> None:
+    gray = encoding == "mono16"
+    colour = np.full((8, 12, 3), (200, 200, 200) if gray else (30, 90, 200), np.uint8)
+    eight = as_encoding(colour, encoding.replace("16", "8")).reshape(8, 12, -1)
+    pixels = np.stack([eight, np.full_like(eight, 7)][:: 1 if big else -1], axis=-1)
+    image = replace(raw_image(pixels, encoding, at(0)), is_bigendian=int(big))
+    drive = open_drive(write_bag(tmp_path / "lap", {"/camera": [(at(0), image)]}))
+    np.testing.assert_array_equal(drive.image(0), colour)
+
+
+def test_an_encoding_in_capitals_is_the_same(tmp_path: Path) -> None:
+    topics: Messages = {"/camera": [(at(0), raw_image(frame_image(2), "BGR8", at(0)))]}
+    np.testing.assert_array_equal(open_drive(write_bag(tmp_path / "lap", topics)).image(0), frame_image(2))
+
+
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422", "uyvy"), ("yuv422_yuy2", "yuyv")])
 def test_raw_images_of_half_the_colours(tmp_path: Path, encoding: str, order: str) -> None:
     # BT.601: a red of y = 81, u = 90, v = 240.
@@ -277,9 +295,9 @@ def test_a_bag_without_images_lists_its_topics(tmp_path: Path) -> None:
 
 
 def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
-    topics: Messages = {"/camera": [(at(0), raw_image(np.zeros((4, 4, 2), np.uint8), "mono16", at(0)))]}
+    topics: Messages = {"/camera": [(at(0), raw_image(np.zeros((4, 4, 2), np.uint8), "32FC1", at(0)))]}
     with pytest.raises(
-        DriveFormatError, match=r"image 0 of /camera: images in 'mono16', expected one of bgr8"
+        DriveFormatError, match=r"image 0 of /camera: images in '32FC1', expected one of bgr8"
     ):
         open_drive(write_bag(tmp_path / "lap", topics))
 

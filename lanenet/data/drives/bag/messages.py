@@ -55,11 +55,11 @@ _ACKERMANN = {
 #: Channels of an encoding, and OpenCV's code that makes it BGR. OpenCV names a Bayer pattern by the second
 #: row and column.
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
-    **dict.fromkeys(("bgr8", "8UC3"), (3, None)),
+    **dict.fromkeys(("bgr8", "8uc3"), (3, None)),
     "rgb8": (3, cv2.COLOR_RGB2BGR),
-    **dict.fromkeys(("bgra8", "8UC4"), (4, cv2.COLOR_BGRA2BGR)),
+    **dict.fromkeys(("bgra8", "8uc4"), (4, cv2.COLOR_BGRA2BGR)),
     "rgba8": (4, cv2.COLOR_RGBA2BGR),
-    **dict.fromkeys(("mono8", "8UC1"), (1, cv2.COLOR_GRAY2BGR)),
+    **dict.fromkeys(("mono8", "8uc1"), (1, cv2.COLOR_GRAY2BGR)),
     "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
     "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
     "bayer_gbrg8": (1, cv2.COLOR_BayerGR2BGR),
@@ -136,7 +136,7 @@ class Decoder:
             message = self.message(data)
             if self.topic.type.endswith("CompressedImage"):
                 return not _is_depth(str(message.format).lower())
-            return message.encoding in _ENCODINGS
+            return _eight_bits(message.encoding) in _ENCODINGS
         except (DriveFormatError, AttributeError):
             return False
 
@@ -149,6 +149,11 @@ def _typestore() -> Any:
         types |= typesys.get_types_from_msg(text, name)
     store.register(types)
     return store
+
+
+def _eight_bits(encoding: str) -> str:
+    """Return the key of an encoding, or of the one with the upper halves of its 16 bits."""
+    return re.sub("16$", "8", encoding.lower().strip())
 
 
 def _is_depth(form: str) -> bool:
@@ -174,7 +179,7 @@ def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, 
     # As gray or BGR with 8 bits, whatever is stored: 16 bits with alpha take 8 bytes a pixel.
     image = decode_image(pixels, where, DriveFormatError, cv2.IMREAD_ANYCOLOR)
     if image.ndim == 2:
-        encoding = re.sub("16$", "8", form.partition(";")[0].strip())
+        encoding = _eight_bits(form.partition(";")[0])
         code = _ENCODINGS[encoding][1] if encoding in _ENCODINGS and "bayer" in encoding else None
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if code is None else code))
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR)) if "compressed rgb" in form else image
@@ -182,16 +187,20 @@ def _packed_image(form: str, pixels: bytes, where: object) -> UInt8[np.ndarray, 
 
 def _raw_image(message: Any, pixels: bytes | memoryview, where: object) -> UInt8[np.ndarray, "h w 3"]:
     height, width, step = int(message.height), int(message.width), int(message.step)
-    if message.encoding not in _ENCODINGS:
+    encoding = _eight_bits(str(message.encoding))
+    if encoding not in _ENCODINGS:
         raise DriveFormatError(
             f"{where}: images in {str(message.encoding)!r}, expected one of {', '.join(_ENCODINGS)}"
         )
-    channels, code = _ENCODINGS[message.encoding]
-    if not (0 < height * width <= MAX_PIXELS and width * channels <= step and len(pixels) == step * height):
+    channels, code = _ENCODINGS[encoding]
+    size = 2 if message.encoding.endswith("16") else 1
+    least = width * channels * size
+    if not (0 < height * width <= MAX_PIXELS and least <= step and len(pixels) == step * height):
         raise DriveFormatError(
             f"{where}: image of {width}x{height} px with {step} bytes a row and {len(pixels)} in all, "
-            f"expected {width * channels} a row or more, and {step * height} in all"
+            f"expected {least} a row or more, and {step * height} in all"
         )
-    rows = np.frombuffer(pixels, np.uint8).reshape(height, step)[:, : width * channels]
+    upper = 0 if getattr(message, "is_bigendian", 0) else size - 1
+    rows = np.frombuffer(pixels, np.uint8).reshape(height, step)[:, upper:least:size]
     image = np.ascontiguousarray(rows).reshape(height, width, channels)
     return image if code is None else np.asarray(cv2.cvtColor(image, code))
