@@ -135,6 +135,9 @@ def _pictures(seen: Sequence[SeenSource], answers_cm: Sequence[np.ndarray]) -> l
         off_cm = np.abs(answers_cm[found.source][found.row] - source.frames.points_cm[found.row])
         side, row = divmod(int(np.nanargmax(off_cm)), len(ROWS_CM))
         where = f"{SIDES[side]} line {show_cm(found.error_cm)} cm off, {ROWS_CM[row]:.0f} cm ahead"
+        line_cm = np.column_stack([source.frames.points_cm[found.row].reshape(len(SIDES), -1)[side], ROWS_CM])
+        if not source.frames.camera.shows_ground(line_cm).any():
+            where += " (out of view)"
         caption = f"frame {source.frames.frames[found.row]}{of}: {where}"
         image = draw_answer(source.frames, found.row, source.answers_cm[found.row], SMALL_PX)
         pictures.append(Picture(image, caption))

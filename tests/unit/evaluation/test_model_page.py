@@ -50,6 +50,18 @@ def test_a_truth_is_not_doubted_and_errors_in_plain_sight_have_their_own_frames(
     assert page.count("frame 107: right line 12.5 cm off") == 4  # alt and caption, in both places
 
 
+def test_a_line_beside_the_picture_is_said_to_be_out_of_view(monkeypatch):
+    beside = TRUTH + np.where(np.arange(6) < 3, 0.0, 80.0)
+    monkeypatch.setitem(globals(), "TRUTH", beside)
+    answers = beside + 0.5
+    answers[7, 4] += 12.0
+    answers[29, 1] += 9.0
+    page, _ = page_of_answers(answers)
+    captions = re.findall("<figcaption>(frame.*?)</figcaption>", page)
+    assert captions[0] == "frame 107: right line 12.5 cm off, 15 cm ahead (out of view)"
+    assert captions[1] == "frame 129: left line 9.50 cm off, 15 cm ahead"
+
+
 def test_a_model_that_answers_nothing_has_a_page():
     page, sentence = page_of_answers(np.full_like(TRUTH, np.nan))
     assert sentence[1:] in page and "Worst frames" not in page and "Along the drive" not in page
