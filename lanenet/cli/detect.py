@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     from lanenet.data.drives.sources import Source
     from lanenet.evaluation.detect import DetectReport, SeenFrame
     from lanenet.geometry.camera import Camera
-    from lanenet.perception.estimate import Detector
+    from lanenet.perception.estimate import Detector, LaneMemory
     from lanenet.viewers.mapped import MapToSee
 
     DetectorName = str
@@ -84,7 +85,10 @@ def detect(
         Path | None,
         typer.Option("--camera", help=f"Camera YAML, or a map of the same car; {_WITHOUT_CAMERA} need none."),
     ] = None,
-    video: Annotated[Path | None, typer.Option(help="Annotated video to write (.mp4).")] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(help="Annotated video to write (.mp4); of one photo a picture (.png, .jpg)."),
+    ] = None,
     lane_width: Annotated[
         float | None,
         typer.Option(
@@ -136,12 +140,14 @@ def detect(
         f"{counted(report.frames, 'frame')}, {report.complete} with all six points, {report.steered} with a "
         f"steering target; {report.median_ms:.2f} ms per frame (median), {report.p99_ms:.2f} ms (p99)"
     )
+    if lane_width is None and (told := _used_width(chosen, report.width_cm)):
+        console.say(told)
     hint = getattr(chosen, "hint", "")
     if hint:
         console.say(f"hint: {hint}")
     console.wrote(report.out, report.video, *views.files)
     if report.video is None:
-        drawn = out.with_suffix(".mp4")
+        drawn = out.with_suffix(".png" if report.frames == 1 else ".mp4")
         if drawn.resolve() == source.resolve():
             drawn = drawn.with_stem(f"{drawn.stem}_lanes")
         again = {
@@ -161,6 +167,18 @@ def detect(
         console.next_command("detect", source, *console.given(again))
     elif report.complete and not hint:
         next_on_car()
+
+
+def _used_width(detector: Detector, seen_cm: float) -> str:
+    """Say of which lane width a detector that can be told one answered; empty if it cannot, or of none."""
+    memory: LaneMemory | None = getattr(detector, "memory", None)
+    if memory is None:
+        return ""
+    if memory.given_cm is not None:
+        return f"lane width: {memory.given_cm:g} cm, that of the source"
+    if math.isnan(seen_cm):
+        return ""
+    return f"lane width: not given; the answers are of {seen_cm:.0f} cm (--lane-width CM, if that is wrong)"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -18,6 +19,7 @@ from lanenet.data.drives.sources import Source
 from lanenet.data.files import atomic_file, check_destination
 from lanenet.errors import CalibrationError, DriveFormatError, UnreadableFrameError
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.lane import lane_width_cm
 from lanenet.perception.draw import draw_estimate
 from lanenet.perception.estimate import Detector, LaneEstimate
 from lanenet.perception.image_lane import ImageLane
@@ -31,6 +33,8 @@ VIDEO_WIDTH_PX = 640
 #: Name of the detector where there is one only.
 ONE = "it"
 VIDEO_ENDINGS = (".mp4", ".m4v", ".mov")
+#: Of what is written in place of a video where there is one frame.
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg")
 Progress = Callable[[int, int], None]
 
 
@@ -104,6 +108,7 @@ class DetectReport:
         median_ms: Median time of the detector per frame.
         p99_ms: 99th percentile of it.
         problems: A line for each frame that could not be read; its row is empty.
+        width_cm: Width of the lane in the answers with all six points, the median; NaN without one.
     """
 
     out: Path
@@ -114,6 +119,7 @@ class DetectReport:
     median_ms: float
     p99_ms: float
     problems: tuple[str, ...]
+    width_cm: float = math.nan
 
 
 def run_detector(
@@ -136,7 +142,7 @@ def run_detector(
         detector: Any detector.
         camera: Camera of the frames, for drawing; None for a detector without one.
         out: Table of detections, ``.parquet`` or ``.csv``.
-        video: Annotated video (mp4v), or None.
+        video: Annotated video (mp4v), or None; of one frame a picture, if its ending is that of one.
         progress: Called with (frames done, frames).
         skip_unreadable: Give a frame that cannot be read an empty row and name it in the report.
         watch: Called with each frame and, under :data:`ONE`, the detector's answer.
@@ -153,12 +159,12 @@ def run_detector(
     # Before the work, which may take an hour.
     check_table_path(out)
     if video is not None:
-        if video.suffix.lower() not in VIDEO_ENDINGS:
-            raise DriveFormatError(f"{video}: a video ends in one of {', '.join(VIDEO_ENDINGS)}")
+        _check_video(video, len(source))
         check_destination(video)
     table = DetectionTable()
     times_s: list[float] = []
     problems: list[str] = []
+    widths_cm: list[float] = []
     complete = steered = 0
     running = run_detectors(source, {ONE: detector}, skip_unreadable=skip_unreadable)
     with ExitStack() as stack:
@@ -168,7 +174,9 @@ def run_detector(
             times_s += seen.seconds.values()
             if seen.problem is not None:
                 problems.append(seen.problem)
-            complete += bool(estimate.mask.all())
+            if estimate.mask.all():
+                complete += 1
+                widths_cm.append(lane_width_cm(estimate.points_cm))
             steered += bool(np.isfinite(estimate.steering_rad))
             table.add(int(source.frames[i]), float(source.t_s[i]), estimate)
             if writer is not None:
@@ -185,9 +193,33 @@ def run_detector(
             )
         table.write(out)
     median_ms, p99_ms = (1e3 * float(np.percentile(times_s, q)) for q in (50, 99))
+    problems = [*source.problems, *problems]
+    width_cm = float(np.nanmedian(widths_cm)) if np.isfinite(widths_cm).any() else math.nan
     return DetectReport(
-        out, video, len(source), complete, steered, median_ms, p99_ms, (*source.problems, *problems)
+        out, video, len(source), complete, steered, median_ms, p99_ms, tuple(problems), width_cm
     )
+
+
+def _check_video(video: Path, frames: int) -> None:
+    if video.suffix.lower() not in (*VIDEO_ENDINGS, *(PICTURE_ENDINGS if frames == 1 else ())):
+        raise DriveFormatError(
+            f"{video}: a video ends in one of {', '.join(VIDEO_ENDINGS)}, and the picture of a single photo "
+            f"in one of {', '.join(PICTURE_ENDINGS)}"
+        )
+
+
+class _OnePicture:
+    """Writes one frame as a picture, where OpenCV's writer of videos would write several."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def write(self, drawn: UInt8[np.ndarray, "h w 3"]) -> None:
+        if not cv2.imwrite(str(self._path), drawn):
+            raise DriveFormatError(f"{self._path}: OpenCV cannot write it")
+
+    def release(self) -> None:
+        """Nothing is held."""
 
 
 class _AnnotatedVideo:
@@ -210,6 +242,9 @@ class _AnnotatedVideo:
         self._size = (width, height)
         self.scale = max(1, -(-VIDEO_WIDTH_PX // width))
         size = (width * self.scale, height * self.scale)
+        if self.path.suffix.lower() in PICTURE_ENDINGS:
+            self._writer = _OnePicture(self._temporary)
+            return
         codec = cv2.VideoWriter.fourcc(*"mp4v")
         self._writer = cv2.VideoWriter(str(self._temporary), codec, self.rate_hz, size)
         if not self._writer.isOpened():

@@ -68,6 +68,12 @@ def test_detect_writes_table_and_video_and_says_so(tmp_path: Path, photos: Path)
         assert text in result.stdout
 
 
+def test_of_one_photo_a_picture_is_suggested_that_is_not_the_photo(tmp_path: Path, photos: Path) -> None:
+    for folder, name in ((tmp_path, "0.png"), (photos, "0_lanes.png")):
+        result = run("detect", photos / "0.png", "--detector", "hough", "--out", folder / "0.csv")
+        assert f"--video {folder / name}" in result.stdout, result.output
+
+
 def test_detect_of_a_map_reads_its_drive(tmp_path: Path) -> None:
     """The pictures in its folder are no photos of a road."""
     frames = example_frames(example_camera(), 3, np.random.default_rng(1))

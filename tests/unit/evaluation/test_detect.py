@@ -117,6 +117,16 @@ def test_endings_are_checked(tmp_path: Path) -> None:
         run_detector(source_of([1]), Scripted(), CAMERA, tmp_path / "l.csv", tmp_path / "l.gif")
 
 
+def test_of_one_photo_a_picture_is_drawn(tmp_path: Path) -> None:
+    for ending in (".png", ".jpg"):
+        picture = tmp_path / f"l{ending}"
+        report = run_detector(source_of([1]), Scripted(), CAMERA, tmp_path / "l.csv", picture)
+        drawn = cv2.imread(str(report.video))
+        assert drawn is not None and drawn.shape == (480, 640, 3) and drawn.std() > 5.0
+    with pytest.raises(DriveFormatError, match=r"\.mp4.*single photo"):
+        run_detector(source_of([1, 2]), Scripted(), CAMERA, tmp_path / "l.csv", picture)
+
+
 def test_video_has_every_frame_and_a_lane_in_it(tmp_path: Path) -> None:
     video = tmp_path / "l.mp4"
     run_detector(source_of([1, 2, 3, 4]), Scripted(), CAMERA, tmp_path / "l.csv", video)
