@@ -76,8 +76,8 @@ def read_tub(path: Path) -> RecordedFrames:
             f"{sequence.frames[missing[0]]}, {sequence.records[missing[0]].image})"
         )
     # Rows of one name are one by now.
-    named = Counter(file for file in files if file is not None)
-    shared = [k for k, file in enumerate(files) if named[file] > 1]
+    named = Counter(files)
+    shared = [k for k, file in enumerate(files) if file is not None and named[file] > 1]
     if shared:
         problems.append(
             f"{folder}: {len(shared)} of {len(files)} rows name images in several folders that are one file "
