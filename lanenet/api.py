@@ -287,7 +287,7 @@ def detect(
         model: Checkpoint folder or ONNX file of a network, or ``hf:owner/name``.
         detector: ``network``, ``lane-filter``, ``hough`` or ``painter``; a model alone means the network.
         camera: Camera file, or a map of the same car; None takes that of the drive or map.
-        video: Annotated video to write (``.mp4``).
+        video: Annotated video to write (``.mp4``); of one photo a picture (``.png``, ``.jpg``).
         lane_width_cm: Between the middles of the lane's two lines; None takes the drive's.
         marking_cm: Width of the tape.
         any_camera: Accept a camera that the model was not trained with.
