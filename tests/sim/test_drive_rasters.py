@@ -68,7 +68,7 @@ def test_the_car_shows_the_network_what_training_showed_it(tmp_path: Path) -> No
     labels = read_labels(tmp_path / "labels.parquet")
     assert report.frames == len(tap.rasters) == len(labels) == 12
     trained_on = LaneSamples([labels], ["labels"]).plain_batch(np.arange(12))[0]
-    column = ParquetTable(tmp_path / "labels.parquet").raw("image")
+    column = list(ParquetTable(tmp_path / "labels.parquet").raw("image"))
     for i, raster in enumerate(tap.rasters):
         assert np.count_nonzero(raster[0]) > 50
         stored = cv2.imdecode(np.frombuffer(column[i]["bytes"], np.uint8), cv2.IMREAD_GRAYSCALE)

@@ -246,7 +246,7 @@ def test_a_map_is_taken_as_it_is(tmp_path, monkeypatch):
     assert len(read_labels(parts[0].labels)) == read_map(drive_map).frames.size
     other = recorded.model_copy(update={"lane_width_cm": 40.0})
     with pytest.raises(
-        ConfigError, match=r"map of a lane of 36 cm, but lane_width_cm is 40.*rescale it in.*lanenet map"
+        ConfigError, match=r"map of a lane of 36 cm, but lane_width_cm is 40.*map it anew: lanenet map"
     ):
         RecordedJob(other, DataSettings(), tmp_path / "work").run()
 
