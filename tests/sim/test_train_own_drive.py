@@ -92,7 +92,7 @@ def test_one_command_goes_from_a_drive_to_a_network(here: Path, first: str) -> N
     log = (here / "runs" / "mycar" / "train.log").read_text()
     for line in first.splitlines()[1:]:
         assert line.strip() in log or "│" in line or "─" in line or not line.strip() or "RMSE" in line
-    assert "map: " in log and f"of {2 * FRAMES}" in log
+    assert "map: " in log and "of 100" in log
 
 
 def test_a_label_set_gives_what_its_map_gives(here: Path, first: str) -> None:
@@ -187,7 +187,7 @@ def test_a_refused_drive_stops_with_cause_remedy_and_report(here: Path) -> None:
     result = train("empty", "--lane-width", "40", "--name", "none")
     assert result.exit_code == 1 and len([x for x in result.stderr.splitlines() if "error" in x]) == 1
     (report,) = here.glob("runs/none/drives/maps/empty-*/report.html")
-    error = result.stderr.splitlines()[-1]
+    error = next(line for line in result.stderr.splitlines() if "error" in line)
     assert "drive two laps" in error and f"see {report.relative_to(here)}" in error
     assert "[2/6]" not in result.stdout and not (here / "checkpoints" / "none").exists()
     assert error.removeprefix("error: ") in (here / "runs" / "none" / "train.log").read_text()
