@@ -49,7 +49,7 @@ print(int(peak.split()[1]) // 1024, round(time.process_time()))
 
 
 def mcap(
-    messages: Iterable[tuple[int, bytes]],
+    messages: Callable[[], Iterable[tuple[int, bytes]]],
     chunk: int,
     compression: CompressionType = CompressionType.ZSTD,
     indexes: IndexType = IndexType.ALL,
@@ -61,7 +61,7 @@ def mcap(
             writer.start("ros2")
             schema = writer.register_schema(kind[0], "", b"")
             channel = writer.register_channel("/camera", kind[1], schema)
-            for t_ns, data in messages:
+            for t_ns, data in messages():
                 writer.add_message(channel, t_ns, data, t_ns)
             writer.finish()
         return folder / "a.mcap"
@@ -109,7 +109,7 @@ def deep_image(folder: Path) -> Path:
     )
     image = {"timestamp": {"sec": 0, "nsec": 0}, "format": "png", "data": base64.b64encode(png).decode()}
     kind = ("foxglove.CompressedImage", "json")
-    return mcap([(0, json.dumps(image).encode())], MEBIBYTE, kind=kind)(folder)
+    return mcap(lambda: [(0, json.dumps(image).encode())], MEBIBYTE, kind=kind)(folder)
 
 
 def label_rows(folder: Path) -> Path:
@@ -151,19 +151,19 @@ def scans(folder: Path) -> Path:
 
 MEGABYTE = bytes(MEBIBYTE)
 FILES = {
-    "a chunk": (mcap([(0, MEGABYTE)] * 1000, 2**31), "MB stand for"),
-    "chunks": (mcap([(k, 40 * MEGABYTE) for k in range(40)], MEBIBYTE), "MB stand for"),
+    "a chunk": (mcap(lambda: [(0, MEGABYTE)] * 1000, 2**31), "MB stand for"),
+    "chunks": (mcap(lambda: ((k, 40 * MEGABYTE) for k in range(40)), MEBIBYTE), "MB stand for"),
     "chunks of LZ4": (
-        mcap([(k, 60 * MEGABYTE) for k in range(2)], MEBIBYTE, CompressionType.LZ4),
+        mcap(lambda: [(k, 60 * MEGABYTE) for k in range(2)], MEBIBYTE, CompressionType.LZ4),
         "MB stand for",
     ),
-    "chunks of one time": (mcap([(0, MEGABYTE)] * 400, 4 * MEBIBYTE), "not in the order of time"),
+    "chunks of one time": (mcap(lambda: [(0, MEGABYTE)] * 400, 4 * MEBIBYTE), "not in the order of time"),
     "chunks without an index": (
-        mcap([(0, MEGABYTE)] * 1000, 4 * MEBIBYTE, CompressionType.ZSTD, IndexType.NONE),
+        mcap(lambda: [(0, MEGABYTE)] * 1000, 4 * MEBIBYTE, CompressionType.ZSTD, IndexType.NONE),
         "not in the order of time",
     ),
     "messages without content": (
-        mcap([(k // 1000, b"") for k in range(400_000)], MEBIBYTE, indexes=IndexType.CHUNK),
+        mcap(lambda: [(k // 1000, b"") for k in range(400_000)], MEBIBYTE, indexes=IndexType.CHUNK),
         "not a readable bag",
     ),
     "lists of one value": (parquet(lists), "MB stand for more than"),
@@ -175,7 +175,7 @@ FILES = {
     ),
     "lists of JSON": (
         mcap(
-            [(0, b'{"data":[' + 10_000_000 * b"[]," + b"0]}")],
+            lambda: [(0, b'{"data":[' + 10_000_000 * b"[]," + b"0]}")],
             MEBIBYTE,
             kind=("foxglove.CompressedImage", "json"),
         ),
