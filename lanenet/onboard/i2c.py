@@ -160,13 +160,13 @@ def describe_process(pid: int) -> str:
     if GUARD_MODULE not in words:
         return text
     # It may have ended since.
-    parent = parent_of(pid)
+    parent = _parent_of(pid)
     if not parent:
         return text
     return f"process {pid}, the guard of process {parent} ({' '.join(words_of(parent))[:60]})"
 
 
-def parent_of(pid: int) -> int:
+def _parent_of(pid: int) -> int:
     """Return the parent of a process; 0 if it is gone."""
     try:
         status = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
