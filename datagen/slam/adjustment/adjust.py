@@ -113,15 +113,24 @@ class BundleResult(BundleEstimate):
         sigma: Standard deviation of each camera parameter (see ``CAMERA_NAMES``; focal relative); 0
             for those that were held.
         residual_px: Residuals of the last round.
-        misfit: Mean robust loss over all compared points; one without an edge counts as if it had met one at
-            the rim of its search. The lower, the better the frames agree.
-        pairs: Number of pairs of frames.
+        pairs: Pairs of frames that were compared, the frame whose points were moved first.
+        in_view: Number of points of each pair that the other image shows.
+        loss: Sum of their robust losses; a point without an edge counts as if it had met one at the rim of
+            its search.
+        prior: Negative log likelihood of the camera among those that the priors expect.
     """
 
     sigma: dict[str, float]
     residual_px: Float[np.ndarray, "r"]
-    misfit: float
-    pairs: int
+    pairs: Int[np.ndarray, "p 2"]
+    in_view: Int[np.ndarray, "p"]
+    loss: Float[np.ndarray, "p"]
+    prior: float = 0.0
+
+    @property
+    def misfit(self) -> float:
+        """Mean robust loss per point in view: the lower, the better the frames agree."""
+        return float(self.loss.sum() / max(int(self.in_view.sum()), 1))
 
     @property
     def robust_sd_px(self) -> float:
@@ -177,10 +186,10 @@ def adjust(
                 damping *= 100.0
     sigma = np.zeros(len(CAMERA_NAMES))
     sigma[problem.free] = problem.camera_sigma(state, links, now)
-    residual_px = now.residual_px
-    unmatched = problem.compared - len(residual_px)
+    residual_px, count = now.residual_px, len(problem.pairs)
     at_rim, matched = (np.log1p((v / settings.cauchy_px) ** 2) for v in (gate_px, residual_px))
-    misfit = (unmatched * at_rim + float(np.nansum(matched))) / max(problem.compared, 1)
+    unmatched = problem.in_view - np.bincount(links.pair, minlength=count)
+    loss = unmatched * at_rim + np.bincount(links.pair, np.nan_to_num(matched), minlength=count)
     height = start.camera.mounting.height_cm
     return BundleResult(
         poses=state.poses * [height, height, 1.0],
@@ -188,8 +197,10 @@ def adjust(
         camera=state.camera_like(start.camera),
         sigma=dict(zip(CAMERA_NAMES, sigma.tolist(), strict=True)),
         residual_px=residual_px[np.isfinite(residual_px)],
-        misfit=float(misfit),
-        pairs=len(problem.pairs),
+        pairs=problem.pairs,
+        in_view=problem.in_view,
+        loss=loss,
+        prior=problem.camera_prior(state),
     )
 
 
@@ -289,7 +300,6 @@ class BundleProblem:
         pairs: Pairs of frames; points of the first are moved into the second.
         points: Pixels that are compared.
         edges: All edges, those of each frame sorted by row, as the kernels search them.
-        compared: Number of comparisons: points times pairs.
         free: Which of the camera parameters may change.
     """
 
@@ -325,9 +335,10 @@ class BundleProblem:
         #: Unknowns of the two frames of each pair.
         self.unknowns = (N_FRAME * self.pairs[:, :, None] + np.arange(N_FRAME)).reshape(-1, 2 * N_FRAME)
         self.inner = inner_pixels(camera, observed.keep)
+        #: Points of each pair that the other image shows, at the last association.
+        self.in_view = np.zeros(len(self.pairs), np.int64)
         #: Comparisons of the pairs before each.
         self.compared_by = np.concatenate([[0], np.cumsum(np.diff(point_starts)[self.pairs[:, 0]])])
-        self.compared = int(self.compared_by[-1])
         self.weight = np.full(len(index), 1.0 / settings.pixel_sigma**2)
         self._lifted: tuple[BundleState, _Lifted] | None = None
         s, centre = settings, settings.centre_px * self.scale
@@ -354,6 +365,7 @@ class BundleProblem:
         """Find the nearest edge of every compared point, and weigh the points by how often they have one."""
         lifted, _, half_px = self.lift(state)
         gate_px *= self.scale
+        self.in_view[...] = 0
 
         def links_of(part: tuple[int, int]) -> tuple[Links, Int[np.ndarray, "2 m"]]:
             most = int(self.compared_by[part[1]] - self.compared_by[part[0]])
@@ -361,7 +373,7 @@ class BundleProblem:
             seen = np.zeros((2, len(self.points.uv)), np.int64)
             count = associate(
                 state, self.pairs, part, self.points, lifted, half_px, self.edges,
-                gate_px, self.inner, seen, links,
+                gate_px, self.inner, seen, self.in_view, links,
             )  # fmt: skip
             return Links(*(column[:count] for column in links)), seen
 
@@ -391,6 +403,11 @@ class BundleProblem:
             descent=np.concatenate([frames_descent, camera_descent]),
             residual_px=residual_px,
         )
+
+    def camera_prior(self, state: BundleState) -> float:
+        """Return the cost of the prior on the camera, also of its numbers that are held."""
+        off = state.camera_minus(self.prior_camera) / self.camera_sigmas
+        return 0.5 * float(off @ off)
 
     def cost(self, state: BundleState, links: Links) -> float:
         """Return the cost of all residuals and priors, in a third of the time of the equations."""

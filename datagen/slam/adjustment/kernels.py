@@ -251,7 +251,7 @@ def lift_points(state, points, part, out, out_by, out_half):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def associate(state, pairs, part, points, lifted, lifted_half, edges, gate_px, inner, seen, links):
+def associate(state, pairs, part, points, lifted, lifted_half, edges, gate_px, inner, seen, in_view, links):
     """Find for every point of frame i the nearest edge of frame j that brightens in the same direction.
 
     The edges of each frame are sorted by row. Only points that fall into ``inner`` get an edge: beyond the
@@ -270,6 +270,7 @@ def associate(state, pairs, part, points, lifted, lifted_half, edges, gate_px, i
         inner: Pixels in which points get an edge.
         seen: Counts in how many frames each point fell into ``inner``, and in how many of these it met an
             edge.
+        in_view: Counts for each pair the points that fell into ``inner``.
         links: Filled from the front.
 
     Returns:
@@ -307,6 +308,7 @@ def associate(state, pairs, part, points, lifted, lifted_half, edges, gate_px, i
             if not inner[int(v + 0.5), int(u + 0.5)]:
                 continue
             seen[0, p] += 1
+            in_view[k] += 1
             nu, nv = nu / length, nv / length
             best, chosen = gate_px * gate_px, -1
             stop = edges.starts[j + 1]

@@ -79,6 +79,10 @@ class BundleSettings(Settings):
     recorded_speed: float = Field(default=0.2, gt=0.0)
     turn_change: float = Field(default=0.01, gt=0.0)
 
+    def going_on(self) -> BundleSettings:
+        """Return the same for a start that was adjusted before, whose edges are looked for nearby alone."""
+        return self.model_copy(update={"gates_px": self.gates_px[-2:]})
+
     def with_free_tilt(self) -> BundleSettings:
         """Return the same with frames that may tilt as they like, for a camera that is yet to be found.
 

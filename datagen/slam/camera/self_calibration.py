@@ -124,6 +124,7 @@ class FoundCamera:
             "sigma": self.sigma,
             "closed": self.closed,
             "height_given": self.height_given,
+            "strain": self.strain,
         }
 
     @property

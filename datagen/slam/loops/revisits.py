@@ -33,6 +33,9 @@ _CONTRAST_PX, _LEAST_CONTRAST = 6.0, 2.0
 #: Sideways shifts, in pixels of a small image, that are tried, since the car comes back with another heading:
 #: a pixel is about 5 degrees.
 _SHIFTS = (-2, -1, 0, 1, 2)
+#: Difference of the headings of an open loop, modulo whole turns, up to which frames may look the same way.
+#: Chosen: half a corner of a ring of tiles.
+_SAME_WAY_RAD = 0.25 * np.pi
 #: Frames to either side over which the similarity of a pair is averaged.
 _DIAGONAL = 4
 #: Frames by which the later visit may miss being the one most similar to the earlier: its neighbours are as
@@ -144,6 +147,9 @@ def propose_revisits(
 ) -> list[tuple[int, int]]:
     """Propose pairs (earlier, later) of frames that are similar and have enough path between them.
 
+    Of each frame the most similar earlier one, and the most similar one of those that the open loop has at
+    the same heading: where all corners look alike, the first is seldom the true one.
+
     Args:
         thumbs: See :func:`thumbnails`.
         poses: Open-loop trajectory, heading unwrapped.
@@ -152,10 +158,9 @@ def propose_revisits(
         camera_height_cm: Sets the scale.
         settings: Bounds.
     """
-    n, path = len(thumbs), path_lengths(poses)
+    n, path, heading = len(thumbs), path_lengths(poses), poses[:, 2]
     run, recording = np.cumsum(periods > 1.0), np.cumsum(periods >= BREAK_PERIODS)
-    before, after = np.zeros(n, np.int64), np.zeros(n, np.int64)
-    score, score_after = np.full(n, -1.0, np.float32), np.full(n, -1.0, np.float32)
+    alike, turned_alike = _MostSimilar.of(n), _MostSimilar.of(n)
     for start in range(0, n, _BLOCK):
         stop = min(start + _BLOCK, n)
         # Averaging reaches beyond the block; frames after it are no earlier visits.
@@ -167,23 +172,58 @@ def propose_revisits(
         unbroken = recording[start:stop] == recording[:stop, None]
         later = np.arange(start, stop) > np.arange(stop)[:, None]
         similarity[(near & unbroken) | ~later] = -1.0
-        before[start:stop], score[start:stop] = similarity.argmax(axis=0), similarity.max(axis=0)
-        best_after = similarity.max(axis=1)
-        higher = np.flatnonzero(best_after > score_after[:stop])
-        score_after[higher], after[higher] = best_after[higher], start + similarity[higher].argmax(axis=1)
-    pairs = [
-        (float(score[later]), int(before[later]), later)
-        for later in range(n)
-        if score[later] >= settings.min_similarity and abs(later - after[before[later]]) <= _MUTUAL
-    ]
+        alike.look(similarity, start)
+        turned = np.abs(wrap_angle(heading[start:stop] - heading[:stop, None]))
+        turned_alike.look(np.where(unbroken & (turned > _SAME_WAY_RAD), -1.0, similarity), start)
     most = max(settings.max_pairs, path[-1] / (settings.pair_heights * camera_height_cm))
-    # The most similar pair of every so many frames, so that no corner takes all the pairs.
+    # The most similar pairs of every so many frames, so that no corner takes all the pairs.
     frames = max(1.0, n / most)
-    best: dict[tuple[int, int], tuple[float, int, int]] = {}
-    for pair in pairs:
-        key = int(run[pair[2]]), int(pair[2] / frames)
-        best[key] = max(best.get(key, pair), pair)
-    return [(earlier, later) for _, earlier, later in sorted(best.values(), key=lambda pair: pair[2])]
+    best: dict[tuple[int, int, bool], tuple[float, int, int]] = {}
+    for found in (alike, turned_alike):
+        for pair in found.pairs(settings):
+            key = int(run[pair[2]]), int(pair[2] / frames), found is alike
+            best[key] = max(best.get(key, pair), pair)
+    return sorted({(earlier, later) for _, earlier, later in best.values()}, key=lambda pair: pair[::-1])
+
+
+class _MostSimilar(NamedTuple):
+    """The most similar earlier frame of each frame, and the most similar later one, with their similarities.
+
+    Attributes:
+        before: The earlier frame.
+        score: Its similarity.
+        after: The later frame.
+        score_after: Its similarity.
+    """
+
+    before: Int[np.ndarray, "n"]
+    score: Float32[np.ndarray, "n"]
+    after: Int[np.ndarray, "n"]
+    score_after: Float32[np.ndarray, "n"]
+
+    @classmethod
+    def of(cls, n: int) -> _MostSimilar:
+        """Return the state before any frame was looked at."""
+        frames, least = np.zeros(n, np.int64), np.full(n, -1.0, np.float32)
+        return cls(frames, least, frames.copy(), least.copy())
+
+    def look(self, similarity: Float32[np.ndarray, "e l"], start: int) -> None:
+        """Take in the similarities of the frames from ``start`` on (columns) to all before them (rows)."""
+        stop = start + similarity.shape[1]
+        self.before[start:stop], self.score[start:stop] = similarity.argmax(axis=0), similarity.max(axis=0)
+        best_after = similarity.max(axis=1)
+        higher = np.flatnonzero(best_after > self.score_after[: len(best_after)])
+        self.score_after[higher] = best_after[higher]
+        self.after[higher] = start + similarity[higher].argmax(axis=1)
+
+    def pairs(self, settings: RevisitSettings) -> list[tuple[float, int, int]]:
+        """Similarity, earlier and later frame of the pairs that are most similar both ways."""
+        return [
+            (float(self.score[later]), int(self.before[later]), later)
+            for later in range(len(self.score))
+            if self.score[later] >= settings.min_similarity
+            and abs(later - self.after[self.before[later]]) <= _MUTUAL
+        ]
 
 
 def propose_beside(

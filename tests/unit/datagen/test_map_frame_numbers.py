@@ -45,7 +45,16 @@ def segment(rows: list[int], seed: int) -> MappedSegment:
         poses=poses,
         steering=None,
         revisits=[],
-        bundle=BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(1), 0.0, 1),
+        bundle=BundleResult(
+            poses,
+            np.zeros((n, 2)),
+            CAMERA,
+            {},
+            np.zeros(1),
+            np.zeros((0, 2), int),
+            np.zeros(0, int),
+            np.zeros(0),
+        ),
         part=np.zeros(n, np.int64),
     )
     lane = TracedLane(zeros, zeros, zeros, 30.0, 2.0)

@@ -34,7 +34,9 @@ SETTINGS = MapSettings(find_bumper=False)
 def _solved(n: int) -> SolvedSegment:
     poses = np.column_stack([3.0 * np.arange(n), np.zeros(n), np.zeros(n)])
     nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
-    bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(5), 1.0, 10)
+    bundle = BundleResult(
+        poses, np.zeros((n, 2)), CAMERA, {}, np.zeros(5), np.zeros((0, 2), int), np.zeros(0, int), np.zeros(0)
+    )
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
     return SolvedSegment(
         np.arange(n), CAMERA, nothing, trajectory, poses, poses, None, [], bundle, np.zeros(n, np.int64)

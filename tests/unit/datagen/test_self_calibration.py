@@ -54,7 +54,16 @@ def found(heading: np.ndarray, revisits: int = 8, focal_sigma: float = 0.02) -> 
     steps = 3.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
     poses = np.column_stack([np.cumsum(steps, axis=0), heading])
     nothing = pack_scans([RoadEdges(np.empty((0, 2)), np.empty((0, 2)))] * n, 15.0)
-    bundle = BundleResult(poses, np.zeros((n, 2)), CAMERA, SIGMA, np.zeros(5), 1.0, 10)
+    bundle = BundleResult(
+        poses,
+        np.zeros((n, 2)),
+        CAMERA,
+        SIGMA,
+        np.zeros(5),
+        np.zeros((0, 2), int),
+        np.zeros(0, int),
+        np.zeros(0),
+    )
     trajectory = Trajectory(poses, np.ones(n), np.ones(n), np.zeros(n))
     places = [REVISIT] * revisits
     solved = SolvedSegment(

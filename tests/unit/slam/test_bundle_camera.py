@@ -52,7 +52,7 @@ def test_a_wrong_camera_comes_back_when_the_loop_is_closed(seed):
     assert f.mounting.yaw_rad == pytest.approx(m.yaw_rad, abs=0.002)
     assert f.mounting.ahead_of_front_axle_cm == pytest.approx(m.ahead_of_front_axle_cm, abs=0.3)
     assert f.mounting.height_cm == m.height_cm and f.wheelbase_cm == camera.wheelbase_cm
-    assert found.pairs == sum(100 - lag for lag in SMALL.lags) + 2 * len(loops)
+    assert len(found.pairs) == sum(100 - lag for lag in SMALL.lags) + 2 * len(loops)
     # The loop makes the focal length known far better than it was.
     assert 0.0 < found.sigma["focal"] < 0.04 < SMALL.focal
 

@@ -88,7 +88,16 @@ def test_revisits_that_the_map_of_keyframes_contradicts_hold_no_frames(monkeypat
     false = Revisit(10, 10 + lap // 2, np.zeros(3), 0.8)
     on_keys = poses[keys]
     still = np.zeros(len(keys))
-    bundle = BundleResult(on_keys, np.zeros((len(keys), 2)), _camera(), {}, np.zeros(1), 1.0, 1)
+    bundle = BundleResult(
+        on_keys,
+        np.zeros((len(keys), 2)),
+        _camera(),
+        {},
+        np.zeros(1),
+        np.zeros((0, 2), int),
+        np.zeros(0, int),
+        np.zeros(0),
+    )
     solved = SolvedSegment(
         keys, _camera(), pack_scans([], 15.0), Trajectory(on_keys, still, still, still), on_keys, on_keys,
         None, [true, false], bundle, np.zeros(len(keys), np.int64),
