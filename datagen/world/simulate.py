@@ -233,7 +233,7 @@ def simulate_drive(
         for done, (state, image) in enumerate(frames, start=1):
             pose = dict(zip(("x_cm", "y_cm", "heading_rad"), map(float, state.pose), strict=True))
             points = dict(zip(POINT_NAMES, map(float, state.points_cm), strict=True))
-            command = _recorded_command(world, state)
+            command = recorded_command(world, state)
             if bang is not None:
                 command["angle"] = bang.angle(command["angle"])
             writer.add(image, state.t_s, truth={**pose, **points}, **command)
@@ -244,7 +244,7 @@ def simulate_drive(
     return out
 
 
-def _recorded_command(world: World, state: DriveState) -> dict[str, float]:
+def recorded_command(world: World, state: DriveState) -> dict[str, float]:
     """Columns of a recording for a command: what was commanded, never what the car did."""
     speed_cm_s, steering_rad = state.speed_cm_s, state.steering_rad
     if world.donkey is None:

@@ -1,11 +1,9 @@
 """Maps of drives that are hard to map, against their truth: ``make traps``.
 
-Sixty simulated drives, six of each kind of trap: corners that are all alike, parallel straights of one look,
-a figure of eight, throttle pulses, pauses, kinks, a lane that widens in bends, dark tape, wide tape, and all
-sorts together; half of them with the camera found from the drive. A row per drive is printed and kept in the
-table as soon as it is known: a run that was killed goes on where it stopped. At the end: maps that are called
-good or usable with wrong labels (there should be none), how many are good, and how far errors of focal length
-and pitch keep within their sigmas.
+Simulated drives of one kind, see :mod:`trap_drives`; of ``roads`` sixty, half of them with the camera found
+from the drive. A row per drive is printed and kept in the table as soon as it is known: a run that was killed
+goes on where it stopped. At the end: maps that are called good or usable with wrong labels (there should be
+none), how many are good, and how far errors of focal length, pitch and height keep within their sigmas.
 """
 
 from __future__ import annotations
@@ -21,134 +19,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
+from trap_drives import KINDS, TrapDrive, drive_settings
 
 from datagen.labels.truth import true_lines
 from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
-from datagen.world.simulate import simulate_drive
-from datagen.world.world import SimulationSettings
+from datagen.world.road.track import read_track
 from lanenet.data.drives import read_truth
 from lanenet.data.maps.folder import read_map
 from lanenet.data.maps.mapped_drive import read_map_frames
 from lanenet.errors import LanenetError
 from lanenet.geometry.birdseye import BirdseyeWindow
-from lanenet.geometry.lane import POINT_NAMES
+from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import map_from_car
+from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
 
-TRAPS = ("corners", "straights", "eight", "pulses", "pauses", "kinks", "widening", "dark", "wide", "mixed")
+__all__ = ["SEED", "drive_settings"]
+
 #: The seed by which the mapping was developed: figures of other seeds count.
 SEED = 77_000
-SPEED_CM_S, RATE_HZ, LAPS = 70.0, 20.0, 2.1
 #: Labels beyond these are wrong: RMSE over all points, and the RMSE of one point over any stretch of one lap.
 MAX_RMSE_CM, MAX_STRETCH_CM, STRETCH_CM = 1.0, 3.0, 30.0
+#: A label further than this from any paint is beside it.
+BESIDE_PAINT_CM = 1.0
 COLUMNS = (
-    "drive", "trap", "camera", "verdict", "frames", "mapped", "labelled", "rmse_cm", "worst_cm",
-    "worst_at_cm", "revisits", "focal_error", "focal_sigma", "pitch_error_deg", "pitch_sigma_deg", "cpu_s",
-    "reason",
+    "drive", "trap", "camera", "told", "verdict", "frames", "mapped", "labelled", "rmse_cm", "worst_cm",
+    "worst_at_cm", "bias_cm", "beside_paint", "revisits", "segments", "closed", "pose_worst_cm",
+    "pose_worst_lanes", "focal_error", "focal_sigma", "pitch_error_deg", "pitch_sigma_deg", "height_error",
+    "height_sigma", "cpu_s", "reason",
 )  # fmt: skip
-
-
-def loop(corners: int, straights_cm: list[float], radius_cm: float | None) -> dict[str, Any]:
-    """Pieces of a loop of like corners, with these straights in turn; kinks if there is no radius."""
-    angle_deg = 360.0 / corners
-    corner: dict[str, Any] = {"kink": {"angle_deg": angle_deg, "direction": "left"}}
-    if radius_cm is not None:
-        corner = {"arc": {"radius_cm": radius_cm, "angle_deg": angle_deg, "direction": "left"}}
-    pieces: list[dict[str, Any]] = []
-    for k in range(corners):
-        pieces += [{"straight": {"length_cm": straights_cm[k % len(straights_cm)]}}, corner]
-    return {"pieces": pieces}
-
-
-def eight(radius_cm: float) -> dict[str, Any]:
-    """Pieces of a figure of eight that crosses itself at a right angle."""
-    half: list[dict[str, Any]] = []
-    for direction in ("left", "right"):
-        half.append({"straight": {"length_cm": 2.0 * radius_cm}})
-        half.append({"arc": {"radius_cm": radius_cm, "angle_deg": 270.0, "direction": direction}})
-    return {"pieces": half, "crosses": True}
-
-
-def road(trap: str, rng: np.random.Generator) -> dict[str, Any]:
-    """A road of one lane with a trap."""
-    lane_cm, radius_cm = float(rng.uniform(30.0, 50.0)), float(rng.uniform(55.0, 70.0))
-    made: dict[str, Any] = {
-        "lane_width_cm": lane_cm,
-        "line_width_cm": float(rng.uniform(6.0, 9.0) if trap == "wide" else rng.uniform(1.8, 5.0)),
-        "min_radius_cm": radius_cm,
-        "closed": True,
-        "length_cm": float(rng.uniform(750.0, 950.0)),
-        "interruptions_per_m": 0.05,
-    }
-    dashed = {"kind": "dashed" if rng.random() < 0.3 else "solid", "dash_cm": 18.0, "gap_cm": 14.0}
-    made |= {"left": dashed, "right": {"kind": "solid"}}
-    straight_cm = float(rng.uniform(70.0, 130.0))
-    number, long_cm = int(rng.integers(3, 6)), float(rng.uniform(220.0, 280.0))
-    if trap in ("corners", "mixed"):
-        made |= loop(number, [straight_cm], radius_cm)
-    elif trap == "straights":
-        made |= loop(4, [long_cm, 0.3 * straight_cm], radius_cm)
-    elif trap == "eight":
-        made |= eight(1.3 * radius_cm)
-    elif trap == "kinks":
-        # Kinks of 45, 60 and 90 degrees.
-        made |= loop({3: 8, 4: 6, 5: 4}[number], [270.0 - 35.0 * (8 - number), straight_cm], None)
-    elif trap == "widening":
-        made |= loop(4, [straight_cm, 1.4 * straight_cm], radius_cm) | {
-            "widening": float(rng.uniform(0.15, 0.4))
-        }
-        made["left"] = {"kind": "solid"}
-    if "pieces" in made:
-        del made["length_cm"]
-    if trap == "dark" or (trap == "mixed" and number > 3):
-        made["left"], made["right"] = made["left"] | {"colour": "black"}, {"kind": "solid", "colour": "black"}
-        made["floor_bgr"] = tuple(float(rng.uniform(150.0, 210.0)) for _ in range(3))
-    return made
-
-
-def drive_settings(number: int, seed: int) -> tuple[SimulationSettings, str, bool]:
-    """Settings of one drive, its trap, and whether the camera is known."""
-    rng = np.random.default_rng(seed + number)
-    trap = TRAPS[number % len(TRAPS)]
-    track = road(trap, rng)
-    speed_cm_s = SPEED_CM_S * float(rng.uniform(0.8, 1.2))
-    gain = float(rng.uniform(0.85, 1.1))
-    gaps = {"pulses": "pulses", "pauses": "pauses", "mixed": ("pulses", "pauses")[number // 10 % 2]}.get(
-        trap, "none"
-    )
-    laps = LAPS * (1.6 if gaps != "none" else 1.0)
-    settings = {
-        "seed": seed + number,
-        "rate_hz": RATE_HZ,
-        "camera": {
-            "width": 160, "height": 120,
-            "field_of_view_rad": math.radians(float(rng.uniform(110.0, 150.0))),
-            "height_cm": float(rng.uniform(14.0, 22.0)),
-            "pitch_down_rad": math.radians(float(rng.uniform(13.0, 25.0))),
-            "roll_rad": float(rng.normal(0.0, 0.012)), "yaw_rad": float(rng.normal(0.0, 0.02)),
-            "distortion": (float(rng.uniform(-0.05, 0.01)), 0.0, 0.0, 0.0),
-        },
-        "track": track,
-        "car": {
-            "wheelbase_cm": float(rng.uniform(16.0, 22.0)),
-            "steering_gain": float(rng.uniform(0.85, 1.1)),
-            "steering_trim_rad": float(rng.uniform(-0.03, 0.03)),
-            "max_steering_rad": 0.6,
-            "speed_gain": gain,
-        },
-        "driver": {
-            "speed_cm_s": speed_cm_s,
-            "speed_variation": float(rng.uniform(0.0, 0.2)),
-            "wander_cm": 0.12 * track["lane_width_cm"],
-            "direction": "backward" if rng.random() < 0.5 else "forward",
-        },
-        "recording": "donkeycar" if gaps != "none" or number % 2 else "commands",
-        "gaps": gaps,
-        "angles": "bang" if gaps == "pulses" else "all",
-    }  # fmt: skip
-    draft = SimulationSettings.model_validate(settings)
-    length_cm = draft.track.length_cm or 0.0
-    frames = int(laps * length_cm / (speed_cm_s * gain / RATE_HZ))
-    return draft.model_copy(update={"frames": frames}), trap, number // len(TRAPS) % 2 == 0
 
 
 def label_errors(folder: Path, drive: Path, wheelbase_cm: float) -> dict[str, Any]:
@@ -156,7 +56,7 @@ def label_errors(folder: Path, drive: Path, wheelbase_cm: float) -> dict[str, An
 
     Returns:
         Share of the labelled points, RMSE, and the worst RMSE of one point over a stretch of one lap with the
-        place along the drive, [cm].
+        place along the drive, [cm]; and the largest mean error of a row, of its left and right point.
     """
     truth = read_truth(drive)
     assert truth is not None
@@ -177,35 +77,112 @@ def label_errors(folder: Path, drive: Path, wheelbase_cm: float) -> dict[str, An
         if rms.max(initial=0.0) > worst_cm:
             worst_cm, worst_at_cm = float(rms.max()), float(start_cm)
     known = np.isfinite(miss_cm)
+    mean_cm = np.abs(np.nansum(miss_cm, axis=0) / np.maximum(known.sum(axis=0), 1))
     return {
         "mapped": len(index),
         "labelled": round(float(known.sum() / max(np.isfinite(true_points).sum(), 1)), 3),
         "rmse_cm": round(float(np.sqrt(np.mean(miss_cm[known] ** 2))), 3) if known.any() else None,
         "worst_cm": round(worst_cm, 2),
         "worst_at_cm": round(worst_at_cm),
+        "bias_cm": round(float(mean_cm.reshape(len(SIDES), len(ROWS_CM)).mean(axis=0).max()), 3),
     }
 
 
-def judge(number: int, folder: Path, seed: int) -> dict[str, Any]:
+def beside_paint(folder: Path, drive: Path, camera: Camera) -> float | None:
+    """Share of the labels that lie beside all lines of the road, in the images.
+
+    A label's pixel is taken back to the ground by the true camera: what a map in another scale labels is
+    judged like any other. Gaps between dashes count as paint.
+
+    Returns:
+        None without labels, or on a road whose lines are not along its track.
+    """
+    truth, track, frames = read_truth(drive), read_track(drive / "track.json"), read_map_frames(folder)
+    assert truth is not None
+    index = read_map(folder).frames
+    ahead_cm = np.broadcast_to(np.tile(np.array(ROWS_CM), len(SIDES)), frames.points_cm.shape)
+    points_cm = np.stack([frames.points_cm, ahead_cm], axis=2)
+    lines = [track.line_beside(0.0, track.length_cm, m.offset_cm) for m in track.markings]
+    if not lines or not np.isfinite(frames.points_cm).any():
+        return None
+    beside, total = 0, 0
+    trees = [(cKDTree(line), 0.5 * m.width_cm) for line, m in zip(lines, track.markings, strict=True)]
+    for k, points in zip(index, points_cm, strict=True):
+        seen = points[np.isfinite(points).all(axis=1)]
+        seen = camera.intersect_ground(frames.camera.project_ground(seen))
+        seen = seen[np.isfinite(seen).all(axis=1)]
+        pose = np.array([truth[name][k] for name in ("x_cm", "y_cm", "heading_rad")])
+        places = map_from_car(seen, pose, camera.wheelbase_cm)
+        off_cm = [np.maximum(tree.query(places)[0] - half_cm, 0.0) for tree, half_cm in trees]
+        beside += int((np.min(off_cm, axis=0) > BESIDE_PAINT_CM).sum())
+        total += len(seen)
+    return round(beside / max(total, 1), 4)
+
+
+def pose_error_cm(folder: Path, drive: Path, scaled: bool) -> float:
+    """Worst distance of a mapped pose from its true place, each segment laid over the truth as a whole.
+
+    Args:
+        folder: The map.
+        drive: The drive with its truth.
+        scaled: Whether a segment may be stretched as well, since its scale is not known.
+    """
+    drive_map, truth = read_map(folder), read_truth(drive)
+    assert truth is not None
+    true = truth["x_cm"] + 1j * truth["y_cm"]
+    worst_cm = 0.0
+    for segment in np.unique(drive_map.segment):
+        rows = drive_map.segment == segment
+        # As complex numbers, whose product turns and stretches: least squares in one line.
+        mapped, place = drive_map.poses[rows] @ np.array([1.0, 1j, 0.0]), true[drive_map.frames[rows]]
+        mapped, place = mapped - mapped.mean(), place - place.mean()
+        turn = np.vdot(mapped, place) / np.vdot(mapped, mapped).real
+        off_cm = np.abs(place - mapped * (turn if scaled else turn / abs(turn)))
+        worst_cm = max(worst_cm, float(off_cm.max()))
+    return worst_cm
+
+
+def camera_errors(found: Camera, true: Camera, sigma: dict[str, float]) -> dict[str, Any]:
+    """Errors of a camera that was found from a drive, and their sigmas as far as they are known."""
+    pitch_rad = found.mounting.pitch_down_rad - true.mounting.pitch_down_rad
+    height = math.log(found.mounting.height_cm / true.mounting.height_cm)
+    return {
+        "focal_error": round(math.log(found.K[0, 0] / true.K[0, 0]), 4),
+        "focal_sigma": round(sigma["focal"], 4),
+        "pitch_error_deg": round(math.degrees(pitch_rad), 3),
+        "pitch_sigma_deg": round(math.degrees(sigma["pitch"]), 3),
+        "height_error": round(height, 4),
+        "height_sigma": round(sigma["height"], 4) if "height" in sigma else "",
+    }
+
+
+def simulated(drive: TrapDrive, folder: Path, number: int) -> tuple[Path, Path]:
+    """Simulate a drive if it is not there yet; return it, and what of it is mapped."""
+    path = folder / f"{number:03d}_{drive.trap}"
+    blind = path.with_name(f"{path.name}_blind")
+    if not (path / "truth.csv").exists():
+        drive.write(path)
+    if not (drive.known or blind.exists()):
+        shutil.copytree(path, blind)
+        (blind / "drive.yaml").unlink()
+        (blind / "camera.yaml").unlink()
+    return path, path if drive.known else blind
+
+
+def judge(kind: str, number: int, folder: Path, seed: int) -> dict[str, Any]:
     """Simulate a drive if it is not there yet, map it, and compare with its truth."""
-    settings, trap, known = drive_settings(number, seed)
-    drive = folder / f"{number:03d}_{trap}"
-    if not (drive / "truth.csv").exists():
-        simulate_drive(settings, drive)
-        if not known:
-            shutil.copytree(drive, blind := drive.with_name(f"{drive.name}_blind"))
-            (blind / "drive.yaml").unlink()
-            (blind / "camera.yaml").unlink()
-    source = drive if known else drive.with_name(f"{drive.name}_blind")
+    made = KINDS[kind].make(number, seed)
+    wheelbase_cm, lane_cm = made.settings.car.wheelbase_cm, made.settings.track.lane_width_cm
+    drive, source = simulated(made, folder, number)
     out = drive.with_name(f"{drive.name}_map")
-    row: dict[str, Any] = {"drive": number, "trap": trap, "camera": "known" if known else "found"}
+    row: dict[str, Any] = {"drive": number, "trap": made.trap, "camera": "known" if made.known else "found"}
     start = time.process_time()
-    map_settings = MapSettings.model_validate({"guess": {"wheelbase_cm": settings.car.wheelbase_cm}})
+    map_settings = MapSettings.model_validate({"guess": {"wheelbase_cm": wheelbase_cm}})
     truth = read_truth(drive)
     assert truth is not None
-    row["frames"] = len(truth["x_cm"])
+    row |= {"told": made.told, "frames": len(truth["x_cm"])}
     try:
-        report = map_drive(MapRequest(source, settings.track.lane_width_cm), map_settings, out)
+        report = map_drive(MapRequest(source, made.told_cm), map_settings, out)
     except LanenetError as error:
         return row | {
             "verdict": "refused",
@@ -215,16 +192,16 @@ def judge(number: int, folder: Path, seed: int) -> dict[str, Any]:
     row["cpu_s"] = round(time.process_time() - start, 1)
     row["verdict"] = report.figures["verdict"]["grade"]
     row["reason"] = "; ".join(report.figures["verdict"]["reasons"])
-    row |= label_errors(out, drive, settings.car.wheelbase_cm)
-    row["revisits"] = sum(segment["revisits"] for segment in report.figures["segments_mapped"])
-    if not known:
-        found, true = read_map(out).camera, settings.camera.build(settings.car.wheelbase_cm)
-        sigma = report.figures["calibration"]["sigma"]
-        row["focal_error"] = round(math.log(found.K[0, 0] / true.K[0, 0]), 4)
-        row["focal_sigma"] = round(sigma["focal"], 4)
-        pitch_rad = found.mounting.pitch_down_rad - true.mounting.pitch_down_rad
-        row["pitch_error_deg"] = round(math.degrees(pitch_rad), 3)
-        row["pitch_sigma_deg"] = round(math.degrees(sigma["pitch"]), 3)
+    true_camera = made.settings.camera.build(wheelbase_cm)
+    row |= label_errors(out, drive, wheelbase_cm)
+    row["beside_paint"] = beside_paint(out, drive, true_camera)
+    segments = report.figures["segments_mapped"]
+    row["revisits"] = sum(segment["revisits"] for segment in segments)
+    row |= {"segments": len(segments), "closed": sum(segment["closed"] for segment in segments)}
+    worst_cm = pose_error_cm(out, drive, scaled=not made.known)
+    row |= {"pose_worst_cm": round(worst_cm, 1), "pose_worst_lanes": round(worst_cm / lane_cm, 2)}
+    if not made.known:
+        row |= camera_errors(read_map(out).camera, true_camera, report.figures["calibration"]["sigma"])
     return row
 
 
@@ -246,10 +223,10 @@ def summary(rows: list[dict[str, Any]]) -> str:
     grades = [row["verdict"] for row in rows]
     counts = ", ".join(f"{grades.count(grade)} {grade}" for grade in ("good", "usable", "reject", "refused"))
     lines.append(f"{len(rows)} drives: {counts}; {sum(map(is_wrong, rows))} good or usable and wrong")
-    for name in ("focal", "pitch"):
+    for name in ("focal", "pitch", "height"):
         unit = "_deg" if name == "pitch" else ""
-        pairs = [(row[f"{name}_error{unit}"], row[f"{name}_sigma{unit}"]) for row in rows]
-        off = np.array([float(e) / float(s) for e, s in pairs if e not in ("", None)])
+        pairs = [(row.get(f"{name}_error{unit}"), row.get(f"{name}_sigma{unit}")) for row in rows]
+        off = np.array([float(e) / float(s) for e, s in pairs if e not in ("", None) and s not in ("", None)])
         if off.size:
             held = int((np.abs(off) <= 2.0).sum())
             lines.append(
@@ -262,7 +239,8 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, required=True, help="drives, maps and the table are kept here")
-    parser.add_argument("--drives", default="0:60", help="first:last, or numbers with commas")
+    parser.add_argument("--kind", choices=KINDS, default="roads", help="another kind needs another folder")
+    parser.add_argument("--drives", help="first:last, or numbers with commas; all of the kind if left out")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument(
         "--seed", type=int, default=SEED, help="of drive 0; another seed needs another folder"
@@ -274,16 +252,17 @@ def main() -> None:
     if table.exists():
         with table.open(newline="") as file:
             rows = list(csv.DictReader(file))
-    first, _, last = args.drives.partition(":")
+    columns = list(rows[0]) if rows else list(COLUMNS)  # those of an earlier version
+    first, _, last = (args.drives or f"0:{KINDS[args.kind].drives}").partition(":")
     numbers = range(int(first), int(last)) if last else [int(n) for n in first.split(",")]
     done = {int(row["drive"]) for row in rows}
     with ProcessPoolExecutor(args.processes) as pool:
         for job in as_completed(
-            [pool.submit(judge, n, args.folder, args.seed) for n in numbers if n not in done]
+            [pool.submit(judge, args.kind, n, args.folder, args.seed) for n in numbers if n not in done]
         ):
             rows.append(dict.fromkeys(COLUMNS, "") | job.result())
             with table.open("a", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS)
+                writer = csv.DictWriter(file, columns, extrasaction="ignore")
                 if not file.tell():
                     writer.writeheader()
                 writer.writerow(rows[-1])

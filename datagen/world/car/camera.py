@@ -33,7 +33,8 @@ class CameraSettings(Settings):
         model: Lens model.
         width: Image width, [px].
         height: Image height, [px].
-        field_of_view_rad: Horizontal, across the whole width; 170 degrees by default.
+        field_of_view_rad: Horizontal, across the whole width, as of a lens before the middle of the image;
+            170 degrees by default.
         distortion: Coefficients k1..k4 (fisheye) or k1, k2, p1, p2 (pinhole).
         height_cm: Of the optical centre above the road.
         pitch_down_rad: Downward tilt; 25 degrees by default.
@@ -41,6 +42,8 @@ class CameraSettings(Settings):
         yaw_rad: Rotation about the vertical, positive looks left.
         ahead_of_front_axle_cm: Optical centre ahead of the front axle.
         right_of_centre_cm: Optical centre to the right of the car's middle.
+        off_middle_px: Principal point right of and below the middle of the image, as after rectifying with
+            another camera's file.
     """
 
     model: Literal["fisheye", "pinhole"] = "fisheye"
@@ -54,6 +57,7 @@ class CameraSettings(Settings):
     yaw_rad: float = 0.0
     ahead_of_front_axle_cm: float = -2.0
     right_of_centre_cm: float = 0.0
+    off_middle_px: tuple[float, float] = (0.0, 0.0)
 
     def build(self, wheelbase_cm: float) -> Camera:
         """Return the camera on a car of this wheelbase.
@@ -62,7 +66,7 @@ class CameraSettings(Settings):
             ConfigError: If the lens model cannot span the field of view.
         """
         mounting = Mounting(**{field.name: getattr(self, field.name) for field in fields(Mounting)})
-        centre = np.array([0.5 * (self.width - 1), 0.5 * (self.height - 1)])
+        centre = np.array([0.5 * (self.width - 1), 0.5 * (self.height - 1)]) + self.off_middle_px
         K = np.array([[1.0, 0.0, centre[0]], [0.0, 1.0, centre[1]], [0.0, 0.0, 1.0]])
         D = np.array(self.distortion)
         unit = Camera(self.model, self.width, self.height, K, D, mounting, wheelbase_cm)

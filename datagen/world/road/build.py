@@ -18,7 +18,7 @@ from datagen.world.road.centre_line import (
 from datagen.world.road.furniture import COLOURS, Colour, Painted, listed_furniture, random_furniture
 from datagen.world.road.pieces import lay_out, length_of
 from datagen.world.road.track import Marking, Track, cut, interrupt, length_beside, paint_dashes, wear_off
-from datagen.world.road.track_settings import LOOP_CM, LineName, MarkingSettings, TrackSettings
+from datagen.world.road.track_settings import LOOP_CM, MarkingSettings, TrackSettings
 from lanenet.errors import ConfigError
 
 #: Between the outer lines of two sections of a random road, in lane widths: no line is near another road's.
@@ -143,7 +143,8 @@ def _check_radii(settings: TrackSettings) -> None:
                 f"lane_width_cm {width_cm:g} and the line_width_cm {tape_cm:g}"
             )
         return
-    inside_cm = {"right": 0.5 * width_cm + tape_cm, "left": (settings.lanes - 0.5) * width_cm + tape_cm}
+    low_cm, high_cm = _reach_cm(settings)
+    inside_cm = {"right": tape_cm - low_cm, "left": high_cm + tape_cm}
     for number, piece in enumerate(settings.pieces):
         for key, radius_cm, direction in piece.bends():
             if radius_cm <= inside_cm[direction]:
@@ -154,6 +155,12 @@ def _check_radii(settings: TrackSettings) -> None:
                 )
 
 
+def _reach_cm(settings: TrackSettings) -> tuple[float, float]:
+    """Offsets of the outermost lines on the right and on the left."""
+    offsets_cm = [offset_cm for offset_cm, _ in settings.lines.values()]
+    return min(offsets_cm), max(offsets_cm)
+
+
 def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLine:
     road_cm = settings.lanes * settings.lane_width_cm
     middle_cm = 0.5 * (road_cm - settings.lane_width_cm)
@@ -161,11 +168,12 @@ def _centre_line(settings: TrackSettings, rng: np.random.Generator) -> CentreLin
         if settings.lanes == 2 and any(piece.kind == "kink" for piece in settings.pieces):
             raise ConfigError(f"{settings.origin}: key 'lanes': found 2, expected 1 on a road with kinks")
         line = lay_out(settings.pieces, settings.closed, settings.origin, settings.crosses)
+        low_cm, high_cm = _reach_cm(settings)
         found = comes_near_itself(
             line,
-            road_cm + settings.line_width_cm,
+            high_cm - low_cm + settings.line_width_cm,
             settings.closed,
-            middle_cm=middle_cm,
+            middle_cm=0.5 * (low_cm + high_cm),
             crosses=settings.crosses,
         )
         if found is not None:
@@ -195,7 +203,7 @@ def _piece_at(settings: TrackSettings, s_cm: float) -> str:
 
 def _line(
     settings: TrackSettings,
-    name: LineName,
+    name: str,
     track: Track,
     kind_rng: np.random.Generator,
     interruption_rng: np.random.Generator,

@@ -83,7 +83,8 @@ def painted_bounds_cm(
     track: Track, margin_cm: float
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return the corners of all that is painted, frame map, with a margin around the road."""
-    reach_cm = track.half_width_cm + abs(track.middle_cm) + margin_cm
+    lines_cm = [abs(marking.offset_cm) for marking in track.markings]
+    reach_cm = max([track.half_width_cm + abs(track.middle_cm), *lines_cm]) + margin_cm
     points = [track.xy_cm - reach_cm, track.xy_cm + reach_cm]
     if len(track.boxes):
         size = (track.boxes[:, 4] + track.boxes[:, 5])[:, None] + 5.0

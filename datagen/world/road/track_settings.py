@@ -15,8 +15,6 @@ from datagen.world.road.pieces import Piece, length_of
 from lanenet.config import Settings, check_settings, read_yaml
 from lanenet.errors import ConfigError, did_you_mean
 
-LineName = Literal["left", "right", "middle", "far"]
-
 #: Length of a road that is given none; chosen: twenty seconds at 60 cm/s.
 LOOP_CM = 1200.0
 
@@ -58,6 +56,16 @@ class MarkingSettings(Settings):
         return self
 
 
+class ExtraLineSettings(MarkingSettings):
+    """A further line along the road, as on a mat with more lanes than the one that is driven.
+
+    Attributes:
+        at_lanes: From the middle of the driven lane, left positive, in lane widths.
+    """
+
+    at_lanes: float
+
+
 class TrackSettings(Settings):
     """A road: from pieces, or drawn at random.
 
@@ -83,6 +91,7 @@ class TrackSettings(Settings):
         right: Line on the right.
         middle: Line between two lanes.
         far: Left line of a road with two lanes.
+        extra_lines: Further lines along a road from pieces; things beside the road do not keep clear of them.
         interruptions_per_m: Sections where paint is missing, for each line.
         max_interruption_cm: Longest such section.
         pieces: The road in the direction of travel; none: a random road.
@@ -106,6 +115,7 @@ class TrackSettings(Settings):
     right: MarkingSettings = MarkingSettings()
     middle: MarkingSettings | None = None
     far: MarkingSettings | None = None
+    extra_lines: tuple[ExtraLineSettings, ...] = ()
     interruptions_per_m: float = Field(default=0.1, ge=0.0)
     max_interruption_cm: float = Field(default=100.0, ge=10.0, le=100.0)
     pieces: tuple[Piece, ...] = ()
@@ -142,6 +152,11 @@ class TrackSettings(Settings):
                 f"key 'widening': found {settings.widening:g} for a road of two lanes, expected 0: only "
                 "roads of one lane widen"
             )
+        if settings.extra_lines and not settings.pieces:
+            raise ValueError(
+                f"key 'extra_lines': found {len(settings.extra_lines)} on a road drawn at random, expected "
+                "none, or a road from pieces"
+            )
         if settings.crosses and not settings.pieces:
             raise ValueError("key 'crosses': found true for a road drawn at random, expected one from pieces")
         if settings.corners > 0.0 and (settings.closed or settings.pieces):
@@ -158,15 +173,17 @@ class TrackSettings(Settings):
         return self._origin
 
     @property
-    def lines(self) -> dict[LineName, tuple[float, MarkingSettings]]:
+    def lines(self) -> dict[str, tuple[float, MarkingSettings]]:
         """The lines with their offsets from the centre line of the driven lane, left positive, [cm]."""
         half_cm = 0.5 * self.lane_width_cm
-        lines: dict[LineName, tuple[float, MarkingSettings | None]] = {
+        lines: dict[str, tuple[float, MarkingSettings | None]] = {
             "left": (half_cm, self.left),
             "middle": (half_cm, self.middle),
             "right": (-half_cm, self.right),
             "far": (3.0 * half_cm, self.far),
         }
+        for number, line in enumerate(self.extra_lines):
+            lines[f"extra_lines.{number}"] = line.at_lanes * self.lane_width_cm, line
         return {name: (at_cm, line) for name, (at_cm, line) in lines.items() if line is not None}
 
     @property

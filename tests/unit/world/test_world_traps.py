@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datagen.world.car.camera import CameraSettings
 from datagen.world.car.recording import BangBang, recorded_frames
 from datagen.world.road.build import random_track
 from datagen.world.road.track import is_painted, read_track, write_track
+from datagen.world.road.track_picture import painted_bounds_cm
 from datagen.world.road.track_settings import TrackSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
@@ -91,6 +93,60 @@ def test_a_lane_widens_in_bends_and_its_lines_are_its_truth(tmp_path):
     )
     with pytest.raises(ConfigError, match="widening"):
         _track({"closed": True, "widening": 0.3, "lanes": 2})
+
+
+BACK = [
+    {"straight": {"length_cm": 200}},
+    {"arc": {"radius_cm": 80, "angle_deg": 230, "direction": "left"}},
+    {"straight": {"length_cm": 95}},
+]
+MAT = OVAL | {
+    "lane_width_cm": 22,
+    "right": {"kind": "dashed"},
+    "left": {"kind": "solid", "colour": "yellow"},
+    "extra_lines": [{"at_lanes": -1.5}, {"at_lanes": 1.5, "kind": "dashed"}, {"at_lanes": 2.5}],
+}
+
+
+def test_further_lines_lie_beside_the_driven_lane():
+    track = _track(MAT)
+    offsets = {round(marking.offset_cm, 6): len(marking.painted_cm) for marking in track.markings}
+    assert sorted(offsets) == [-33.0, -11.0, 11.0, 33.0, 55.0]
+    assert offsets[-33.0] == offsets[11.0] == offsets[55.0] == 1
+    assert min(offsets[-11.0], offsets[33.0]) > 10
+    assert [marking.offset_cm for marking in track.reversed().markings] == [
+        pytest.approx(-marking.offset_cm) for marking in track.markings
+    ]
+    # The lane that is driven, and its truth, are those of the road without them.
+    alone = _track({name: value for name, value in MAT.items() if name != "extra_lines"})
+    pose = np.array([100.0, 0.0, 0.0])
+    np.testing.assert_array_equal(track.truth(pose, 20.0), alone.truth(pose, 20.0))
+    low, high = painted_bounds_cm(track, 0.0)
+    assert (high - low)[1] == pytest.approx(160.0 + 2.0 * 55.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"pieces": [], "length_cm": 900}, "extra_lines"),
+        # Inside the bends of 80 cm radius.
+        ({"extra_lines": [{"at_lanes": 3.6}]}, "radius_cm"),
+        # It comes back to within 58 cm.
+        ({"pieces": BACK, "closed": False}, "meets itself"),
+    ],
+)
+def test_further_lines_need_room(changes, named):
+    with pytest.raises(ConfigError, match=named):
+        _track(MAT | changes)
+    _track(MAT | changes | {"extra_lines": []})
+
+
+def test_a_lens_beside_the_middle_has_the_same_focal_length():
+    plain = CameraSettings(width=640, height=480).build(20.0)
+    moved = CameraSettings(width=640, height=480, off_middle_px=(80.0, -30.0)).build(20.0)
+    np.testing.assert_allclose(moved.K - plain.K, [[0.0, 0.0, 80.0], [0.0, 0.0, -30.0], [0.0, 0.0, 0.0]])
+    ahead = np.array([[5.0, 40.0]])
+    np.testing.assert_allclose(moved.project_ground(ahead) - plain.project_ground(ahead), [[80.0, -30.0]])
 
 
 def test_pulses_and_pauses_are_as_in_public_tubs():
