@@ -23,7 +23,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype -rs --fail-on-skips all \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train general install env test test-data test-slow test-base-install chain traps left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-data test-slow test-base-install chain traps fit-labels left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then a network from nothing by $(CONFIG), into checkpoints/$(NAME)/"
@@ -34,7 +34,8 @@ help:
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  the wheel and the source archive in empty environments, with every Python there is"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of all but one config; two processes"
-	@echo "make traps        maps of sixty drives that are hard to map (goes on where it stopped), and broken maps"
+	@echo "make traps        maps of drives that are hard to map, of one KIND (goes on where it stopped), and broken maps"
+	@echo "make fit-labels   the model of label errors, from drives of four kinds with their truth; hours"
 	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
 	@echo "make leaderboard  all detectors ranked by left-out track, from what make left-out measured"
 	@echo "make judge        both networks and all baselines on 160 roads in closed loop (goes on where it stopped)"
@@ -99,10 +100,22 @@ chain: $(VENV)/.stamp-dev
 	  tests/sim/test_chain.py tests/sim/test_train_own_drive.py \
 	  tests/contracts/test_configs.py tests/unit/learn/test_learn_parallel.py::test_two_processes_train_as_one
 
-# Most of an hour on one core; TRAPS adds arguments, such as --drives 0:20 --processes 2.
+# Roads take most of an hour on one core; KIND is another one of trap_drives.py: tiles, office, mats, floors, shifted.
+# TRAPS adds arguments, such as --drives 0:20 --processes 2.
+KIND ?= roads
 traps: $(VENV)/.stamp-dev
-	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --folder runs/traps $(TRAPS)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --kind $(KIND) --folder runs/traps/$(KIND) $(TRAPS)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps/$(KIND)
+
+# Goes on where it stopped; FIT_KINDS and TRAPS narrow it.
+FIT_KINDS ?= roads tiles office mats
+fit-labels: $(VENV)/.stamp-dev
+	$(PIP) -e '.[fit]'
+	for kind in $(FIT_KINDS); do \
+	  OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --kind $$kind --folder runs/labels/$$kind $(TRAPS) && \
+	  OMP_NUM_THREADS=1 $(BIN)/python tests/bench/label_tables.py runs/labels/$$kind --out runs/labels/$$kind/tables --spoilt 2 \
+	    || exit 1; done
+	$(BIN)/python tests/bench/fit_label_error.py $(FIT_KINDS:%=runs/labels/%/tables) --out datagen/quality/label_error.npz
 
 # Half an hour on one core, once make general has made its drives; needs the real ones of tests/configs/tubs.yaml.
 # LEFT_OUT adds arguments, such as --start checkpoints/mine.

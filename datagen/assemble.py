@@ -16,6 +16,7 @@ from datagen.quality.figures import free_lane_cm, map_edges, scaled_figures, seg
 from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.odometry.scans import distances_seen
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import car_from_map
 
@@ -153,7 +154,7 @@ def assemble(
         tilt_rad=_in_order(segments, [s.solved.bundle.tilt for s in segments]),
         held_out=prepared.held_out[rows],
         # Found by the check.
-        contradicted=np.zeros((len(rows), 2), dtype=bool),
+        errors=LabelErrors.none(len(rows)),
         marks=tuple(prepared.marks[row] for row in rows.tolist()) if prepared.marks else None,
     )
     return AssembledMap(

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from datagen.assemble import AssembledMap
 from datagen.lanes.trace import other_lane
 from datagen.prepare import PreparedDrive
+from datagen.quality.evidence import label_features
 from datagen.quality.figures import (
     map_evidence,
     map_figures,
     map_notes,
     steering_answer,
 )
-from datagen.quality.measure import VERDICT_REACH_CM, MapQuality, measure_map, quality_figures
-from datagen.quality.places import withheld_figures, withhold_wrong_places
-from datagen.quality.residuals import contradicted_lines, summarise
+from datagen.quality.label_error import doubted_by, predict_errors
+from datagen.quality.measure import (
+    VERDICT_REACH_CM,
+    MapQuality,
+    WrongSection,
+    label_evidence,
+    measure_map,
+    quality_figures,
+    withheld_figures,
+    wrong_sections,
+)
+from datagen.quality.residuals import summarise
 from datagen.quality.verdict import Verdict, judge
 from lanenet.data.drives import Drive
 from lanenet.data.maps.mapped_drive import MappedDrive, points_text
@@ -69,11 +83,11 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     figures = map_figures(drive_map, assembled.segments)
     notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
-    mapped, quality = compare_with_frames(mapped)
+    mapped, quality, withheld = compare_with_frames(mapped, camera_figures)
+    figures["withheld"] = withheld
     drive_map = mapped.drive_map
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
     figures |= quality_figures(quality)
-    figures["withheld"] = withheld_figures(drive_map, list(quality.wrong))
     figures["lane_width"] = asdict(assembled.lane)
     steering = steering_answer(mapped)
     figures["steering_correlation"] = None if steering is None else steering.correlation
@@ -85,20 +99,42 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     }
     labelled = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
     notes.append(f"{labelled}; {points_text(quality.point_shares)}")
-    evidence = map_evidence(drive_map, camera_figures | figures, drive.deleted[assembled.rows], free_cm)
-    verdict = judge(evidence, prepared.settings.verdict)
-    meta = drive_map.meta.model_copy(update={"verdict": verdict.grade})
+    labels = label_evidence(mapped, quality)
+    figures["labels"] = asdict(labels)
+    verdict = judge(
+        map_evidence(drive_map, camera_figures | figures, labels, free_cm), prepared.settings.verdict
+    )
+    meta = drive_map.meta.model_copy(update={"verdict": verdict.grade, "state": verdict.state})
     mapped = replace(mapped, drive_map=replace(drive_map, meta=meta))
     return CheckedMap(mapped, quality, verdict, figures | {"verdict": asdict(verdict)}, tuple(notes))
 
 
-def compare_with_frames(mapped: MappedDrive) -> tuple[MappedDrive, MapQuality]:
-    """Mark what the images of a map contradict, and measure the rest in its held-out frames."""
-    drive_map, wrong = withhold_wrong_places(mapped)
-    mapped = replace(mapped, drive_map=drive_map)
-    contradicted = drive_map.contradicted | contradicted_lines(mapped)
-    mapped = replace(mapped, drive_map=replace(drive_map, contradicted=contradicted))
-    return mapped, replace(measure_map(mapped), wrong=tuple(wrong))
+def compare_with_frames(
+    mapped: MappedDrive, camera_figures: dict[str, Any]
+) -> tuple[MappedDrive, MapQuality, dict[str, Any]]:
+    """Predict the errors of a map's labels, mark where it is wrong, and measure it in held-out frames.
+
+    Returns:
+        The map with these errors, what its frames show, and the figures of the sections that are wrong.
+    """
+    drive_map = mapped.drive_map
+    features = label_features(mapped, camera_figures)
+    errors = predict_errors(features)
+    wrong, share = wrong_sections(drive_map, features, errors)
+    lines = {
+        segment: [replace(line, contradicted_cm=_sections(wrong, segment, line.index)) for line in found]
+        for segment, found in drive_map.lines.items()
+    }
+    mapped = replace(mapped, drive_map=replace(drive_map, lines=lines, errors=errors))
+    quality = measure_map(mapped)
+    doubted = doubted_by(features, errors, np.isfinite(quality.points_cm))
+    withheld = withheld_figures(drive_map, wrong, share)
+    return mapped, replace(quality, wrong=tuple(wrong), doubted=doubted), withheld
+
+
+def _sections(wrong: Sequence[WrongSection], segment: int, index: int) -> Float[np.ndarray, "w 2"]:
+    own = [one.section_cm for one in wrong if (one.segment, one.index) == (segment, index)]
+    return np.array(sorted(own)).reshape(-1, 2)
 
 
 def check_lines_seen(

@@ -214,7 +214,7 @@ def write_checked(
     write_text(folder / SETTINGS_NAME, dump_settings(settings))
     write_tum(folder / "open_loop.tum", drive_map.t_s, assembled.open_poses)
     if pictures:
-        _draw(folder, out, assembled, checked, figures, settings)
+        _draw(folder, out, assembled, checked, figures)
 
 
 def _draw(
@@ -223,7 +223,6 @@ def _draw(
     assembled: AssembledMap,
     checked: CheckedMap,
     figures: dict[str, Any],
-    settings: MapSettings,
 ) -> None:
     """Draw the map, some of its frames, and the page of the report."""
     mapped = checked.mapped
@@ -232,5 +231,5 @@ def _draw(
     shown = np.linspace(0, len(drive_map.frames) - 1, _SHOWN).astype(int)
     draw_contact_sheet(folder / "frames.png", mapped, shown)
     png = (folder / "map.png").read_bytes()
-    page = report_page(mapped, checked.quality, checked.verdict, figures, opened, png, settings.verdict, out)
+    page = report_page(mapped, checked.quality, checked.verdict, figures, opened, png, out)
     write_text(folder / PAGE_NAME, page)

@@ -21,12 +21,11 @@ from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.data.maps.mapped_drive import (
     AWAY,
     BETWEEN_LANES,
-    CONTRADICTED,
     DELETED,
+    DOUBTFUL,
     NO_LINE,
     NOT_TO_LABEL,
     OUTSIDE,
-    UNCERTAIN,
     check_images,
     label_frames,
     labelled_points,
@@ -90,7 +89,7 @@ def label_map(
     found = label_frames(mapped, window)
     left_out = {
         reason: found.reasons.count(reason)
-        for reason in (DELETED, UNCERTAIN, CONTRADICTED, BETWEEN_LANES, AWAY, NO_LINE, OUTSIDE)
+        for reason in (DELETED, DOUBTFUL, BETWEEN_LANES, AWAY, NO_LINE, OUTSIDE)
     }
     rows = np.array([k for k, reason in enumerate(found.reasons) if not reason], dtype=np.int64)
     if not rows.size:

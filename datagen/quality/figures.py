@@ -7,19 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from datagen.lanes.find import MappedSegment
-from datagen.quality.verdict import LineEvidence, MapEvidence
+from datagen.quality.verdict import LabelEvidence, MapEvidence
 from datagen.slam.commands import commands_of, delayed
 from datagen.slam.loops.pose_graph import revisit_residuals
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
-from lanenet.data.maps.mapped_drive import MappedDrive, known_lines
+from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
-#: Of a line's residuals, in the order of :class:`datagen.quality.verdict.LineEvidence`.
-_LINE_FIGURES = ("samples", "coverage", "robust_sd_px_at_160", "p95_px_at_160")
 #: Delays of the steering that are tried, in frames, and correlation with the path's curvature below which the
 #: steering's sign is not known, also in sigmas of chance. Chosen: half a second at 20 frames a second; the
 #: recorded drives reach 0.6 to 0.98.
@@ -188,35 +186,19 @@ def steering_answer(mapped: MappedDrive) -> SteeringAnswer | None:
     return strongest if abs(strongest.correlation) >= least else None
 
 
-def contradicted_share(
-    contradicted: Bool[np.ndarray, "n 2"], known: Bool[np.ndarray, "n 2"], deleted: Bool[np.ndarray, "n"]
-) -> float:
-    """Share of the frames' lines that the images contradict.
-
-    Args:
-        contradicted: Left and right line of the map's frames.
-        known: Which of them the frames have, see :func:`lanenet.data.maps.mapped_drive.known_lines`; only
-            these count.
-        deleted: Frames that the driver deleted; they do not count, since the car may have left the road.
-    """
-    counted = known & ~deleted[:, None]
-    return float(contradicted[counted].mean()) if counted.any() else 0.0
-
-
 def map_evidence(
-    drive_map: DriveMap, figures: dict[str, Any], deleted: Bool[np.ndarray, "n"], free_cm: float | None
+    drive_map: DriveMap, figures: dict[str, Any], labels: LabelEvidence, free_cm: float | None
 ) -> MapEvidence:
     """Collect the evidence for the verdict.
 
     Args:
         drive_map: The map.
         figures: Figures of the map and of its quality.
-        deleted: Frames of the map that the driver deleted.
+        labels: What its labels hold.
         free_cm: See :func:`free_lane_cm`.
     """
     meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
-    held = figures["held_out"]
-    both, reach = held["both_lines"], f"0-{held['reach_cm']:g} cm"
+    calibration = figures.get("calibration", {})
     across = [
         (segment["closure_residual_median"]["across_cm"], segment["revisits"])
         for segment in figures["segments_mapped"]
@@ -224,48 +206,35 @@ def map_evidence(
     ]
     revisits = sum(count for _, count in across)
     # A given camera that the drive has refined counts as known: its lens was not searched for.
-    known = not figures.get("calibration", {}).get("candidates")
+    known = not calibration.get("candidates")
+    found_cm = meta.mapped_lane_cm if free_cm is None else free_cm
     return MapEvidence(
-        lines={
-            side: LineEvidence(*(line[reach][name] for name in _LINE_FIGURES))
-            for side, line in held["lines"].items()
-        },
-        p95_px=both["p95_px_at_160"],
-        coverage=both["coverage"],
-        labelled_share=figures["labelled"]["share"],
-        point_shares=figures["labelled"]["points_in_window"],
-        contradicted_share=contradicted_share(drive_map.contradicted, known_lines(drive_map), deleted),
-        withheld=tuple(withheld_text(place) for place in figures["withheld"]["places"]),
-        withheld_share=figures["withheld"]["share"],
-        not_labelled=figures["labelled"]["why_not"],
+        labels=labels,
+        coverage=figures["held_out"]["both_lines"]["coverage"],
+        wrong=tuple(withheld_text(place) for place in figures["withheld"]["places"]),
+        wrong_share=figures["withheld"]["share"],
         revisits=revisits,
+        laps=meta.laps,
         closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm
         if revisits
         else None,
         camera_known=known,
-        sigma={} if known else figures["calibration"]["sigma"],
+        sigma={} if known else calibration["sigma"],
+        # Reports of earlier versions do not know.
+        strain=0.0 if known else calibration.get("strain", 0.0),
         given_lane_cm=meta.lane_width_cm,
         bend_lane_cm=figures["lane_width"]["bend_cm"],
         open_lane_cm=figures["lane_width"]["open_cm"],
-        # If the free search found nothing better, the traced lane.
-        found_lane_cm=None
-        if meta.scale_from == "lane width"
-        else meta.mapped_lane_cm
-        if free_cm is None
-        else free_cm,
+        found_lane_cm=None if meta.scale_from == "lane width" else found_cm,
         height_cm=height_cm,
         tape_cm=meta.tape_cm,
-        height_given=bool(figures.get("calibration", {}).get("height_given")),
+        height_given=bool(calibration.get("height_given")),
         given_height_cm=figures["given"]["camera_height_cm"],
         given_tape_cm=figures["given"]["tape_width_cm"],
-        outside_share=figures["labelled"]["outside_share"],
-        # Null in a report that was read back.
-        in_view=float("nan") if (seen := figures["labelled"]["in_view"]) is None else seen,
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
         segments=len(figures["segments_mapped"]),
-        # Reports of earlier versions do not know.
         pauses=figures.get("pauses", 0),
     )
 

@@ -8,14 +8,16 @@ its own, but not errors that all poses share.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import uniform_filter1d
 
-from datagen.quality.places import WrongPlace
+from datagen.quality.evidence import LabelFeatures
 from datagen.quality.residuals import (
     BANDS_CM,
     GATE_PX,
@@ -26,6 +28,9 @@ from datagen.quality.residuals import (
     reference_scale,
     summarise,
 )
+from datagen.quality.verdict import LabelEvidence
+from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.mapped_drive import (
     DELETED,
     NOT_TO_LABEL,
@@ -35,9 +40,11 @@ from lanenet.data.maps.mapped_drive import (
     labelled_points,
     lines_at,
 )
+from lanenet.data.segments import true_runs
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import ROWS_CM, SIDES
+from lanenet.geometry.poses import path_lengths
 
 #: Status of a frame, beside the reasons of :mod:`lanenet.data.maps.mapped_drive`; reports use these as keys.
 NOT_MAPPED, LABELLED = "segment not mapped", "labelled"
@@ -47,6 +54,42 @@ VERDICT_REACH_CM = 45.0
 _STREAM = 1
 #: Least number of residuals for the median of a frame. Chosen: one border over 10 cm.
 _MIN_SAMPLES = 10
+
+
+#: Length of a place of a line, and length over which labels are taken together and below which a section is
+#: not named, [cm]. Chosen: a tenth of a dash, half a dash.
+_PLACE_CM, _SHORTEST_CM = 2.0, 10.0
+#: Radius of the path below which it is a bend, length over which its turn is taken, and longest step that
+#: counts as seen road, [cm]. Chosen: five times the tightest bend of a 1:10 car, and a label row.
+_BEND_RADIUS_CM, _TURN_CM, _STEP_CM = 250.0, 30.0, 15.0
+
+
+@dataclass(frozen=True)
+class WrongSection:
+    """A section of a line along which most labels are more likely off by 3 cm than not.
+
+    Attributes:
+        segment: Segment of the map.
+        index: Number of the line, see :attr:`lanenet.data.maps.line.LaneLine.index`.
+        section_cm: From and to along the line.
+        frames: Frames that show it, as positions in the map.
+    """
+
+    segment: int
+    index: int
+    section_cm: tuple[float, float]
+    frames: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the line: that of its side, seen in the path's direction."""
+        side, rank = (SIDES[0], -self.index) if self.index <= 0 else (SIDES[1], self.index - 1)
+        return f"{side} line" + (" of the adjacent lane" if rank else "")
+
+    @property
+    def length_cm(self) -> float:
+        """Length of the section."""
+        return self.section_cm[1] - self.section_cm[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +104,7 @@ class MapQuality:
         points_cm: Six labels per frame of the map.
         in_window: Which points a complete map would label; none for frames that are not to be labelled.
         wrong: Sections of the lines that are withheld, the longest first.
+        doubted: See :attr:`datagen.quality.verdict.LabelEvidence.doubted`.
         scale: Reference pixels per pixel, see :func:`datagen.quality.residuals.reference_scale`.
         in_view: Share of the labels whose places lie in the image; NaN without labels.
     """
@@ -71,7 +115,8 @@ class MapQuality:
     status: list[str]
     points_cm: Float[np.ndarray, "n 6"]
     in_window: Bool[np.ndarray, "n 6"]
-    wrong: tuple[WrongPlace, ...] = ()
+    wrong: tuple[WrongSection, ...] = ()
+    doubted: dict[str, float] = field(default_factory=dict)
     scale: float = 1.0
     in_view: float = float("nan")
 
@@ -124,7 +169,7 @@ def measure_map(mapped: MappedDrive) -> MapQuality:
     for k, edges, keep in frame_edges(mapped, rows):
         lines, nodded = lines_at(drive_map, k), drive_map.camera_at(k)
         samples.append(border_samples(edges, lines, tape_cm, nodded, keep))
-        left = lines.without(np.array([False, True]))
+        left = lines.without(np.repeat([False, True], len(ROWS_CM)))
         chance.append(border_samples(edges, left, tape_cm, nodded, keep, aside_cm=0.5 * lane_cm))
     status = [DELETED if deleted else NOT_MAPPED for deleted in drive.deleted]
     labels = label_frames(mapped, BirdseyeWindow())
@@ -135,6 +180,86 @@ def measure_map(mapped: MappedDrive) -> MapQuality:
     seen = share_in_view(drive_map.camera, points_cm)
     return MapQuality(
         rows, samples, join_samples(chance), status, points_cm, in_window, scale=scale, in_view=seen
+    )
+
+
+def wrong_sections(
+    drive_map: DriveMap, features: LabelFeatures, errors: LabelErrors
+) -> tuple[list[WrongSection], float]:
+    """Find the sections along which most labels of a line are more likely off by 3 cm than not.
+
+    Returns:
+        The sections, the longest first, and their share of the length along which the driven lane's lines
+        have labels.
+    """
+    found: list[WrongSection] = []
+    seen = wrong = 0.0
+    around = 2 * int(0.5 * _SHORTEST_CM / _PLACE_CM) + 1
+    for segment, lines in drive_map.lines.items():
+        for line in lines:
+            mine = (features.line == line.index) & (drive_map.segment == segment)[:, None]
+            frame, point = np.nonzero(mine & np.isfinite(errors.off_3))
+            low, high = line.span_cm
+            count, closed = max(1, int((high - low) / _PLACE_CM)), line.period_cm is not None
+            place_cm = (high - low) / count
+            place = np.floor((features.s_cm[frame, point] - low) / place_cm).astype(np.int64)
+            place = place % count if closed else np.clip(place, 0, count - 1)
+            off = errors.off_3[frame, point] > 0.5
+            sums = np.stack([np.bincount(place, w, count) for w in (np.ones(len(place)), off)])
+            of_all, of_wrong = uniform_filter1d(
+                sums, min(around, count), axis=1, mode="wrap" if closed else "constant"
+            )
+            against = (of_wrong > 0.5 * of_all) & (of_all > 1e-9)
+            if line.rank == 0:
+                seen, wrong = seen + float((of_all > 1e-9).sum()), wrong + float(against.sum())
+            for run in true_runs(against, closed):
+                if len(run) * place_cm >= _SHORTEST_CM:
+                    start = low + float(run[0]) * place_cm
+                    shown = np.unique(frame[off & np.isin(place, run)])
+                    section = (start, start + len(run) * place_cm)
+                    found.append(WrongSection(segment, line.index, section, tuple(shown.tolist())))
+    return sorted(found, key=lambda one: -one.length_cm), wrong / max(seen, 1.0)
+
+
+def withheld_figures(drive_map: DriveMap, wrong: Sequence[WrongSection], share: float) -> dict[str, Any]:
+    """Return the report's figures on the sections that are withheld, the longest first."""
+    places = [
+        {
+            "segment": one.segment,
+            "line": one.name,
+            "from_cm": one.section_cm[0],
+            "to_cm": one.section_cm[1],
+            "frames": [int(drive_map.frames[k]) for k in one.frames],
+        }
+        for one in wrong
+    ]
+    return {"share": share, "places": places}
+
+
+def label_evidence(mapped: MappedDrive, quality: MapQuality) -> LabelEvidence:
+    """Collect what the labels of a map hold."""
+    drive_map, given = mapped.drive_map, np.isfinite(quality.points_cm)
+    way_cm = path_lengths(drive_map.poses)
+    step_cm = np.minimum(np.diff(way_cm, prepend=0.0), _STEP_CM) * given.any(axis=1)
+    ahead = np.minimum(np.searchsorted(way_cm, way_cm + _TURN_CM), len(way_cm) - 1)
+    turn = np.diff(drive_map.poses[:, 2][np.stack([np.arange(len(ahead)), ahead])], axis=0)[0]
+    bend = turn * _BEND_RADIUS_CM / _TURN_CM
+    off_1, off_3 = (
+        float(off[given].mean()) if given.any() else float("nan")
+        for off in (drive_map.errors.off_1, drive_map.errors.off_3)
+    )
+    return LabelEvidence(
+        frames=sum(status not in NOT_TO_LABEL for status in quality.status),
+        labelled=quality.status.count(LABELLED),
+        off_1=off_1,
+        off_3=off_3,
+        metres=0.01 * float(step_cm.sum()),
+        left_m=0.01 * float(step_cm[bend > 1.0].sum()),
+        right_m=0.01 * float(step_cm[bend < -1.0].sum()),
+        not_labelled={why: n for why, n in quality.not_labelled.items() if why not in NOT_TO_LABEL},
+        doubted=quality.doubted,
+        in_view=quality.in_view,
+        outside_share=quality.outside_share,
     )
 
 

@@ -17,16 +17,14 @@ from datagen.quality.residuals import REFERENCE_WIDTH
 from datagen.quality.rows import (
     camera_rows,
     loop_rows,
-    number,
     percent,
     residual_rows,
     scale_rows,
     share_rows,
     summary_rows,
 )
-from datagen.quality.verdict import MOST_LINES, Verdict, VerdictSettings, verdict_lines
+from datagen.quality.verdict import MOST_LINES, Verdict, verdict_lines
 from datagen.quality.without_map import commands_without_map
-from lanenet.data.drives import Drive
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.page import (
@@ -60,7 +58,6 @@ def report_page(
     figures: dict[str, Any],
     opened_poses: Float[np.ndarray, "n 3"],
     map_png: bytes,
-    settings: VerdictSettings,
     folder: Path,
 ) -> str:
     """Write the report of a map as HTML.
@@ -72,7 +69,6 @@ def report_page(
         figures: The contents of ``report.json``.
         opened_poses: Poses before the loops were closed, in the map's scale.
         map_png: Picture of the map from above.
-        settings: Bounds of the verdict, drawn in the residual plot.
         folder: Where the map will be.
     """
     drive, drive_map = mapped.drive, mapped.drive_map
@@ -112,7 +108,7 @@ def report_page(
             "Best and median held-out frames",
             *(subsection(title.capitalize()) + gallery(shown) for title, shown in pictures.items()),
         ),
-        details("Distance of the lines from the edges", *_residuals(quality, held, drive, settings)),
+        details("Distance of the lines from the edges", *_residuals(quality, held)),
         details("Labels", table(share_rows(figures["labelled"]))),
         details(
             "Path and loops",
@@ -144,13 +140,11 @@ def _shown_map(map_png: bytes, drive_map: DriveMap) -> Picture:
     if any(line.rank for lines in drive_map.lines.values() for line in lines):
         caption += " Turquoise: a line of the lane beside it."
     if any(len(line.contradicted_cm) for lines in drive_map.lines.values() for line in lines):
-        caption += " Red: withheld, since the images show something else there."
+        caption += " Red: withheld, since the line is likely wrong there."
     return Picture(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), caption)
 
 
-def _residuals(
-    quality: MapQuality, held: dict[str, Any], drive: Drive, settings: VerdictSettings
-) -> list[str]:
+def _residuals(quality: MapQuality, held: dict[str, Any]) -> list[str]:
     return [
         note(
             "Distance in pixels between the projected borders of the driven lane's two lines and the edges "
@@ -161,10 +155,10 @@ def _residuals(
             "because of paint."
         ),
         plot(
-            "Above: distance of edges from the lines by how far ahead they are; dotted: the bounds of a good "
-            "map. Below: how much of the lines' borders met an edge.",
+            "Above: distance of edges from the lines by how far ahead they are. Below: how much of the "
+            "lines' borders met an edge.",
             residual_plot,
-            *(quality, settings.max_sd_px, settings.max_p95_px),
+            quality,
         ),
         table(residual_rows(held, quality.scale)),
     ]
@@ -193,16 +187,16 @@ def withheld_section(mapped: MappedDrive, quality: MapQuality, places: list[dict
     pictures = withheld_pictures(mapped, quality.wrong)
     if not pictures:
         return []
-    rows: list[Row] = [("line", "along the path, cm", "border seen, cm to the right", "frames")]
+    rows: list[Row] = [("line", "along the path, cm", "frames")]
     for place in places:
         frames = ", ".join(str(frame) for frame in place["frames"][:_FRAMES_NAMED])
         span = f"{place['from_cm']:.0f} to {place['to_cm']:.0f}"
-        rows.append((place["line"], span, number(place["beside_cm"], 0), frames))
+        rows.append((place["line"], span, frames))
     return [
         section("Withheld"),
         note(
-            "Red: most frames that pass here do not see the line where the map has it, but a border beside "
-            "it, or none. No frame gets labels of a line there."
+            "Red: by what most frames show that pass here, the line is more likely off by 3 cm than not. No "
+            "frame gets labels of it there."
         ),
         gallery(pictures),
         details("Where that is", table(rows)),

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from datagen.quality.measure import MapQuality
-from datagen.quality.places import WrongPlace
+from datagen.quality.measure import MapQuality, WrongSection
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.frame_lines import FrameLines
 from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
@@ -129,11 +128,11 @@ def _polyline(  # type: ignore[no-untyped-def]
 def draw_contact_sheet(path: Path, mapped: MappedDrive, chosen: Int[np.ndarray, "n"]) -> None:
     """Draw the chosen frames of a map with their projected lines (green left, magenta right) and points.
 
-    Lines that the images contradict, and that have no labels, are red.
+    What is withheld, since its labels are likely to be wrong, is red.
     """
     drive_map, tiles = mapped.drive_map, []
     for k in map(int, chosen):
-        lines, wrong = lines_at(drive_map, k), drive_map.contradicted[k]
+        lines, wrong = lines_at(drive_map, k), drive_map.errors.withheld[k]
         text = f"{drive_map.frames[k]}"
         kept, withheld = lines.without(wrong), lines.without(~wrong)
         tiles.append(draw_lines(_frame(mapped, k), kept, drive_map.camera, text, withheld))
@@ -213,7 +212,7 @@ def _held_out(mapped: MappedDrive, quality: MapQuality, picks: np.ndarray) -> li
     return pictures
 
 
-def withheld_pictures(mapped: MappedDrive, wrong: tuple[WrongPlace, ...]) -> list[Picture]:
+def withheld_pictures(mapped: MappedDrive, wrong: tuple[WrongSection, ...]) -> list[Picture]:
     """Draw frames that show the longest sections that are withheld, in red."""
     drive_map = mapped.drive_map
     as_mapped = replace(
@@ -225,7 +224,7 @@ def withheld_pictures(mapped: MappedDrive, wrong: tuple[WrongPlace, ...]) -> lis
     )
     pictures = []
     for place in wrong[:_PICTURES]:
-        k = place.frames[0]
+        k = place.frames[len(place.frames) // 2]
         drawn = draw_lines(
             _frame(mapped, k), lines_at(drive_map, k), drive_map.camera_at(k), "", lines_at(as_mapped, k)
         )

@@ -57,7 +57,7 @@ def trajectory_plot(mapped: MappedDrive, opened_poses: Float[np.ndarray, "n 3"])
     return png_bytes(figure)
 
 
-def residual_plot(quality: MapQuality, max_sd_px: float, max_p95_px: float) -> bytes:
+def residual_plot(quality: MapQuality) -> bytes:
     """Residuals and coverage over the distance ahead, by line."""
     figure, (axes, below) = _figure(4.4, 2)
     every = join_samples(quality.samples)
@@ -75,8 +75,6 @@ def residual_plot(quality: MapQuality, max_sd_px: float, max_p95_px: float) -> b
         ):
             axes.plot(centres, values, style, color=_COLOURS[side], label=f"{side}, {name}", lw=0.9, ms=3)
         below.plot(centres, [100.0 * b.coverage for b in bins], "o-", color=_COLOURS[side], label=side, ms=3)
-    for bound in (max_sd_px, max_p95_px):
-        axes.axhline(bound, color="gray", lw=0.8, ls=":")
     for ax in (axes, below):
         ax.axvline(VERDICT_REACH_CM, color="gray", lw=0.8, ls=":")
     axes.set(ylim=(0.0, None), ylabel="px at 160 px width")

@@ -4,11 +4,6 @@ On a textured floor there is always some edge close by. So an edge counts only i
 marking, as the border does; on a map of dark markings, if it darkens towards it. Two coverages put the
 residuals into perspective: the share of the border in view that met an edge, and the same share for a line
 shifted off its marking.
-
-A map that is wrong in one place has good figures as a whole. At that place, the frames contradict it: the
-borders of its lines meet no edge, or edges beside them. Such frames get no labels, and neither do frames
-close to them on the road, since only these frames saw their near points. If one of the two lines is
-contradicted, only that line is masked.
 """
 
 from __future__ import annotations
@@ -25,10 +20,9 @@ from datagen.slam.odometry.scans import edges_of_drive
 from datagen.slam.stripes import true_borders
 from datagen.slam.view import mapping_range
 from lanenet.data.maps.frame_lines import FrameLines
-from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
+from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import SIDES
-from lanenet.geometry.poses import path_lengths
 from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RoadTable
 
@@ -47,25 +41,6 @@ _MIN_AGREEMENT = 0.8
 _STEP_CM = 1.0
 #: Limits of the distance bands ahead of the front axle: the label rows and beyond.
 BANDS_CM = (0.0, 15.0, 30.0, 45.0, 90.0)
-#: Every how many frames one is checked. Chosen: neighbouring frames show nearly the same.
-_EVERY = 3
-#: A frame contradicts the map if the median distance of the edges exceeds the first, in pixels of an image
-#: 160 px wide, or if the coverage is below the second. Chosen: right maps keep below 0.5 px; both lines are
-#: seldom interrupted at once.
-_OFF_PX, _LEAST_MET = 1.0, 0.15
-#: The same for one line, if both together agree. Derived: edges met by chance have a median of 2 px, half the
-#: gate, so every other frame contradicts a wrong line; a lower bound masks lines that are right.
-_ALONE_PX = 2.0
-#: Sigma up to which a line is checked, in lane widths. Chosen: lines with a larger sigma bridge gaps, where
-#: no paint is expected.
-_KNOWN_LANES = 0.02
-#: Least number of samples of a frame: in view, and with an edge. Chosen: one border over 15 cm.
-_MIN_VIEW, _MIN_MET = 15, 8
-#: Samples up to this distance ahead count. Chosen: twice the farthest label row.
-_REACH_CM = 60.0
-#: Distance along the path up to which frames count for a place, and the share that has to contradict the map.
-#: Chosen: a single bad frame is outvoted, and an error over 20 cm of road is not.
-_AROUND_CM, _SHARE = 20.0, 0.3
 
 
 def reference_scale(camera: Camera) -> float:
@@ -268,57 +243,3 @@ def frame_edges(
     found = edges_of_drive(mapped.drive.subset(mapped.rows[rows]), perception.edges, table)
     for k, edges in zip(rows.tolist(), true_borders(found, table), strict=True):
         yield k, edges.towards_dark() if dark else edges, table.keep
-
-
-def contradicted_lines(mapped: MappedDrive) -> Bool[np.ndarray, "n 2"]:
-    """Return which left and right lines of the map's frames are contradicted by the images around."""
-    drive_map = mapped.drive_map
-    n = len(drive_map.frames)
-    checked = np.arange(0, n, _EVERY)
-    scale = reference_scale(drive_map.camera)
-    against, counts = np.zeros((len(checked), 2), dtype=bool), np.zeros(len(checked), dtype=bool)
-    for i, (k, edges, keep) in enumerate(frame_edges(mapped, checked)):
-        lines = lines_at(drive_map, k, _KNOWN_LANES)
-        samples = border_samples(edges, lines, drive_map.meta.tape_cm, drive_map.camera_at(k), keep)
-        samples = samples.select(samples.ahead_cm < _REACH_CM)
-        counts[i] = len(samples.residual_px) >= _MIN_VIEW
-        if counts[i]:
-            against[i] = _contradicts(samples, scale)
-    contradicted = np.zeros((n, 2), dtype=bool)
-    distance = path_lengths(drive_map.poses)
-    for k in range(n):
-        valid = np.flatnonzero(counts & (drive_map.segment[checked] == drive_map.segment[k]))
-        near = valid[np.abs(distance[checked[valid]] - distance[k]) < _AROUND_CM]
-        if not near.size:
-            # In a long gap, the last frame before it and the first one after it decide.
-            i = int(np.searchsorted(checked[valid], k))
-            near = valid[max(i - 1, 0) : i + 1]
-        if near.size:
-            contradicted[k] = against[near].mean(axis=0) > _SHARE
-    return contradicted
-
-
-def _contradicts(samples: BorderSamples, scale: float) -> tuple[bool, bool]:
-    """Whether a frame contradicts its left and its right line.
-
-    Missing paint counts against the map only where both lines lack it; a line that met too few edges by
-    itself is not contradicted.
-    """
-    met = samples.residual_px[samples.found]
-    if met.size < _LEAST_MET * len(samples.residual_px):
-        return True, True
-    if _off_px(met, scale) > _OFF_PX:
-        # Both: if the pose is lost, one of the lines may meet edges by chance.
-        return True, True
-    left, right = (
-        _off_px(samples.residual_px[samples.found & (samples.right == side)], scale) > _ALONE_PX
-        for side in (False, True)
-    )
-    return left, right
-
-
-def _off_px(met_px: Float[np.ndarray, "m"], scale: float) -> float:
-    """Median distance of the edges, in reference pixels; NaN if they are too few."""
-    if met_px.size < _MIN_MET:
-        return float("nan")
-    return float(np.median(np.abs(met_px))) * scale

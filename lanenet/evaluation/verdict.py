@@ -48,12 +48,12 @@ def verdict_sentence(comparison: Comparison, seen: Sequence[SeenSource], where: 
     source = seen[worst[0].source].frames
     frame = int(source.frames[worst[0].row])
     of = f" of {Path(source.name).name}" if len(comparison.sources) > 1 else ""
-    doubt = ", where the images contradict the map itself" if _contradicted(source.name, frame) else ""
+    doubt = ", where the map itself is in doubt" if _doubted(source.name, frame) else ""
     return f"{said}, the worst near frame {frame}{of} by {show_cm(worst[0].error_cm)} cm{doubt}"
 
 
-def _contradicted(source: str, frame: int) -> bool:
-    """Tell whether the images around a frame contradict the map that the labels come from."""
+def _doubted(source: str, frame: int) -> bool:
+    """Tell whether labels around a frame are doubted by the map that they come from."""
     if not (Path(source) / "map.yaml").is_file():
         return False
     try:
@@ -61,4 +61,4 @@ def _contradicted(source: str, frame: int) -> bool:
     except MapFormatError:  # its frames could be read; without its figures there is nothing to say
         return False
     near = np.abs(drive_map.frames - frame) <= _NEAR_FRAMES
-    return bool(drive_map.contradicted[near].any())
+    return bool(drive_map.errors.doubted[near].any())

@@ -18,8 +18,7 @@ import numpy as np
 
 from datagen.check import compare_with_frames
 from datagen.quality.figures import map_evidence
-from datagen.quality.measure import quality_figures
-from datagen.quality.places import withheld_figures
+from datagen.quality.measure import label_evidence, quality_figures
 from datagen.quality.verdict import VerdictSettings, judge
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import MappedDrive, label_frames, open_mapped_drive
@@ -72,11 +71,10 @@ def check(mapped: MappedDrive, good_cm: np.ndarray, folder: Path) -> tuple[str, 
         The grade, and of the labels that it still gives, against those of the good map, the RMSE and the
         worst RMSE of one point over a stretch, [cm].
     """
-    mapped, quality = compare_with_frames(mapped)
     figures = json.loads((folder / "report.json").read_text())
+    mapped, quality, figures["withheld"] = compare_with_frames(mapped, figures)
     figures |= quality_figures(quality)
-    figures["withheld"] = withheld_figures(mapped.drive_map, list(quality.wrong))
-    evidence = map_evidence(mapped.drive_map, figures, mapped.drive.deleted[mapped.rows], None)
+    evidence = map_evidence(mapped.drive_map, figures, label_evidence(mapped, quality), None)
     grade = judge(evidence, VerdictSettings()).grade
     off_cm = quality.points_cm - good_cm
     way_cm = path_lengths(mapped.drive_map.poses)

@@ -34,6 +34,7 @@ from lanenet.data.drives.sources import open_source, read_mask
 from lanenet.data.files import write_json
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta, read_map, write_map
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.data.tables import write_csv
 from lanenet.geometry.camera import Mounting
@@ -130,7 +131,7 @@ def make_map(folder: Path) -> None:
         lines={0: [line("left", 18.0), line("right", -18.0)]},
         tilt_rad=np.zeros((n, 2)),
         held_out=np.zeros(n, bool),
-        contradicted=np.zeros((n, 2), bool),
+        errors=LabelErrors.none(n),
     )
     write_map(folder, lane, {"frame": np.arange(3)}, {"frames": n}, "by hand")
 

@@ -24,6 +24,7 @@ from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import read_map, write_map
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.mapped_drive import open_mapped_drive
 from lanenet.errors import LanenetError
 from lanenet.learn import export
@@ -80,8 +81,9 @@ def a_map(drive: Path) -> Path:
     map_drive(MapRequest(drive, 40.0), MapSettings(find_bumper=False), out, pictures=False)
     # Its first frames only: a label set encodes an image of each, and every one may fail.
     found = read_map(out)
-    names = ("frames", "t_s", "poses", "lap", "segment", "s_cm", "match", "tilt_rad", "held_out")
-    first = {name: getattr(found, name)[:SHOWN] for name in (*names, "contradicted")}
+    names = ("frames", "t_s", "poses", "lap", "segment", "s_cm", "match", "tilt_rad", "held_out", "marks")
+    first = {name: getattr(found, name)[:SHOWN] for name in names}
+    first["errors"] = LabelErrors(*(column[:SHOWN] for column in found.errors))
     write_map(out, replace(found, **first), {"frame": found.frames[:SHOWN]}, {}, "from the drive")
     return out
 

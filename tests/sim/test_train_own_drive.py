@@ -22,8 +22,8 @@ from lanenet.data.label_set import read_labels
 # `make test-slow`.
 pytestmark = pytest.mark.slow
 
-#: Half of these are one part for the validation, with the gaps before and after it.
-FRAMES = 320
+#: Half of these are one part for the validation, with the gaps before and after it; 10 m of road with labels.
+FRAMES = 400
 
 
 def train(*words: str) -> Result:

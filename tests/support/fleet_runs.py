@@ -13,9 +13,13 @@ from datagen.fleet.result import FleetResult
 from datagen.fleet.run import label_all
 from datagen.fleet.storage import Storage
 from datagen.fleet.task import FleetDrive, FleetSettings
+from datagen.quality.verdict import VerdictSettings
 from datagen.settings import MapSettings
 
-SETTINGS = FleetSettings(map=MapSettings(find_bumper=False))
+#: The least amounts are such that labels of the short drive are good.
+SETTINGS = FleetSettings(
+    map=MapSettings(find_bumper=False, verdict=VerdictSettings(min_frames=30, min_metres=1.0))
+)
 LANE_CM = 40.0
 
 

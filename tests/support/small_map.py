@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.geometry.camera import Camera, Mounting
 
@@ -64,5 +65,5 @@ def small_map() -> DriveMap:
         },
         tilt_rad=rng.normal(0.0, 0.01, (N, 2)),
         held_out=np.arange(N) % 10 == 3,
-        contradicted=np.arange(N)[:, None] // 4 == [2, 3],
+        errors=LabelErrors.withholding(np.repeat(np.arange(N)[:, None] // 4 == [2, 3], 3, axis=1)),
     )

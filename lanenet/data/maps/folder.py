@@ -20,6 +20,7 @@ from lanenet.data.camera_file import MAP_CAMERA_NAME, read_own_camera, write_cam
 from lanenet.data.drives.recording import MAX_TIME_S
 from lanenet.data.files import require, write_json, write_text
 from lanenet.data.maps.frame_lines import FrameLanes, assign_lanes
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.tables import (
     MAX_PLACE,
@@ -32,7 +33,7 @@ from lanenet.data.tables import (
 )
 from lanenet.errors import ConfigError, MapFormatError
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import SIDES
+from lanenet.geometry.lane import N_POINTS, POINT_NAMES, SIDES
 from lanenet.outputs import restore_output
 from lanenet.reading import FolderFiles, parsing, read_json
 
@@ -43,9 +44,15 @@ _EDGES_FORMAT = "lanenet-edges/2"
 _REPORT_FORMAT = "lanenet-map-report/1"
 #: The resolved settings of the mapping, in the map's folder.
 SETTINGS_NAME = "settings.yaml"
-#: Columns of ``poses.csv``; the last ones say that images contradict the left, the right line.
+#: Columns of ``poses.csv``; the last ones, of older maps, say that images contradict the left or right line.
 _POSE, _TILT = ("x_cm", "y_cm", "heading_rad"), ("pitch_rad", "roll_rad")
+_ERRORS = tuple(
+    f"{name}_{point.removesuffix('_cm')}" for name in LabelErrors._fields for point in POINT_NAMES
+)
 _CONTRADICTED = tuple(f"contradicted_{side}" for side in SIDES)
+#: Matched share of a frame's edge points below which its pose is uncertain on older maps. The lowest match
+#: in the first 300 frames of data/donkey_circuit is 0.24, the median 0.66.
+_MIN_MATCH = 0.15
 
 #: See :mod:`lanenet.data.drives.content`.
 _MARK = re.compile(r"[0-9]{1,18}-[0-9a-f]{16}")
@@ -73,7 +80,9 @@ class MapMeta(Settings):
         markings: Whether the markings are lighter or darker than the floor.
         ahead_sigma_cm: Sigma of distances ahead of the car at the far label row, where the camera was found
             from the drive, see :func:`datagen.lanes.scale.ahead_sigma`; 0 for a given camera.
-        verdict: How far the map can be trusted; None until it has been judged.
+        verdict: How far its labels can be trusted; None until it has been judged.
+        state: Whether the map as a whole is closed, open, or wrong in sections; None until it has been
+            judged, and in a map of an earlier version.
         options: Options of ``lanenet map`` that asked for the map, but for the lane width; a config stands as
             ``CONFIG``. None in a map of an earlier version.
     """
@@ -88,6 +97,7 @@ class MapMeta(Settings):
     markings: Literal["light", "dark"] = "light"
     ahead_sigma_cm: float = Field(default=0.0, ge=0.0, le=MAX_PLACE)
     verdict: Literal["good", "usable", "reject"] | None = None
+    state: Literal["closed", "open", "wrong in sections"] | None = None
     options: tuple[str, ...] | None = None
 
     def command(self, folder: Path, lane_width_cm: float | None = None) -> str:
@@ -132,8 +142,7 @@ class DriveMap:
         lines: Lines of each segment: left and right of the driven lane, then those of adjacent lanes.
         tilt_rad: Pitch and roll of each frame, added to the camera's mounting.
         held_out: Frames whose edge points were not used for the lines.
-        contradicted: Whether the images around a frame contradict its left, its right line, see
-            :mod:`datagen.quality.residuals`.
+        errors: Predicted errors of the labels, see :mod:`datagen.quality.label_error`.
         marks: By what the image of each frame is known again, see
             :func:`lanenet.data.drives.content.image_marks`; None in a map of an earlier version.
     """
@@ -150,7 +159,7 @@ class DriveMap:
     lines: dict[int, list[LaneLine]]
     tilt_rad: Float[np.ndarray, "n 2"]
     held_out: Bool[np.ndarray, "n"]
-    contradicted: Bool[np.ndarray, "n 2"]
+    errors: LabelErrors
     marks: tuple[str, ...] | None = None
 
     def camera_at(self, k: int) -> Camera:
@@ -193,11 +202,11 @@ def write_map(
         "match": m.match,
         **dict(zip(_TILT, m.tilt_rad.T, strict=True)),
         "held_out": m.held_out,
-        **dict(zip(_CONTRADICTED, m.contradicted.T, strict=True)),
+        **dict(zip(_ERRORS, np.concatenate(m.errors, axis=1).T, strict=True)),
     }
     if m.marks is not None:
         columns["image"] = m.marks
-    write_csv(folder / "poses.csv", columns, allow_empty=("match",))
+    write_csv(folder / "poses.csv", columns, allow_empty=("match", *_ERRORS))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
     write_camera(folder / "camera.yaml", m.camera, how_calibrated)
     lines = [
@@ -271,7 +280,9 @@ def read_map(folder: Path) -> DriveMap:
             "t_s": ColumnSpec(low=-MAX_TIME_S, high=MAX_TIME_S),
             # Below 0 where most edges face the other way than those of the map.
             "match": ColumnSpec(allow_empty=True, low=-_MOST_MATCH, high=_MOST_MATCH),
-            **{name: ColumnSpec("int", low=0.0, high=1.0) for name in ("held_out", *_CONTRADICTED)},
+            "held_out": ColumnSpec("int", low=0.0, high=1.0),
+            **dict.fromkeys(_ERRORS, ColumnSpec(required=False, allow_empty=True, low=0.0, high=MAX_PLACE)),
+            **dict.fromkeys(_CONTRADICTED, ColumnSpec("int", required=False, low=0.0, high=1.0)),
             "image": ColumnSpec("text", required=False, allow_empty=True),
         },
         error=MapFormatError,
@@ -291,9 +302,22 @@ def read_map(folder: Path) -> DriveMap:
         lines=_read_lines(lines, {int(segment) for segment in table["segment"]}),
         tilt_rad=np.stack([table[name] for name in _TILT], axis=1),
         held_out=table["held_out"] > 0,
-        contradicted=np.stack([table[name] for name in _CONTRADICTED], axis=1) > 0,
+        errors=_read_errors(poses, table),
         marks=None if "image" not in table else tuple(table["image"].tolist()),
     )
+
+
+def _read_errors(path: Path, table: dict[str, np.ndarray]) -> LabelErrors:
+    """The errors of the labels; an older map withholds what images contradict, and where few edges match."""
+    older = any(name in table for name in _CONTRADICTED)
+    names = _CONTRADICTED if older else _ERRORS
+    if missing := [name for name in names if name not in table]:
+        raise MapFormatError(f"{path}: no column {missing[0]!r}")
+    columns = np.stack([table[name] for name in names], axis=1)
+    if older:
+        uncertain = ~(table["match"] >= _MIN_MATCH)[:, None]
+        return LabelErrors.withholding(np.repeat((columns > 0) | uncertain, N_POINTS // len(SIDES), axis=1))
+    return LabelErrors(*np.split(columns, len(LabelErrors._fields), axis=1))
 
 
 def _check_poses(path: Path, table: dict[str, np.ndarray]) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.segments import equal_runs, true_runs
 from lanenet.geometry.frames import car_from_map
-from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, N_POINTS, STEEPEST, label_rows
+from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, N_POINTS, ROWS_CM, STEEPEST, label_rows
 
 #: Spacing of a polyline's points. Chosen: chords of a 50 cm bend deviate by 0.1 mm.
 _SAMPLE_CM = 2.0
@@ -43,13 +43,16 @@ class FrameLines:
     points_cm: Float[np.ndarray, "6"]
     widths_cm: tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]] | None = None
 
-    def without(self, hidden: Bool[np.ndarray, "2"]) -> FrameLines:
-        """Mask the left, the right or both lines."""
-        lines = [
-            np.full_like(line, np.nan) if gone else line
-            for line, gone in zip((self.left_cm, self.right_cm), hidden, strict=True)
-        ]
-        points_cm = np.where(np.repeat(hidden, N_POINTS // 2), np.nan, self.points_cm)
+    def without(self, hidden: Bool[np.ndarray, "6"]) -> FrameLines:
+        """Mask some of the six labels, and of the lines what is nearest to them.
+
+        A view from elsewhere, made for training, would get labels of it.
+        """
+        lines = []
+        for line, gone in zip((self.left_cm, self.right_cm), hidden.reshape(2, -1), strict=True):
+            row = np.abs(line[:, 1:] - np.array(ROWS_CM)).argmin(axis=1)
+            lines.append(np.where(gone[row][:, None], np.nan, line))
+        points_cm = np.where(hidden, np.nan, self.points_cm)
         return replace(self, left_cm=lines[0], right_cm=lines[1], points_cm=points_cm)
 
     def markings_cm(self, side: int, usual_cm: float) -> Float[np.ndarray, "m"]:

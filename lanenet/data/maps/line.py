@@ -44,8 +44,9 @@ class LaneLine:
         sigma_at_cm: Sigma of the line's position across the path there.
         marking_cm: Measured width of the marking; NaN if unknown.
         unpainted: Share of the line without paint, as near frames see it; NaN if unknown.
-        contradicted_cm: Sections (from, to) of s that the images contradict, see
-            :mod:`datagen.quality.places`; as for support, one across the seam ends beyond the period.
+        contradicted_cm: Sections (from, to) of s along which the line is likely wrong, see
+            :func:`datagen.quality.measure.wrong_sections`; as for support, one across the seam ends beyond
+            the period.
         marking_at_cm: Width of the marking where sigma is given; empty if it is the same everywhere.
     """
 

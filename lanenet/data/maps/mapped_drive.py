@@ -33,14 +33,11 @@ _log = logging.getLogger(__name__)
 #: one. Chosen: no table of times is rounded to more than a millisecond, and a drive recorded anew has other
 #: times throughout.
 _SAME_TIME_S, _MOST_OTHER_TIMES = 2e-3, 0.5
-#: Matched share of a frame's edge points below which its pose is uncertain. The lowest match in the
-#: first 300 frames of data/donkey_circuit is 0.24, the median 0.66.
-_MIN_MATCH = 0.15
 #: Sigma of a line's position above which it gives no label, in lane widths. Chosen: 1.4 cm of a 36 cm lane.
 _MAX_SIGMA_LANES = 0.04
 #: Why a frame gets no labels. The reports count frames under these keys.
-DELETED, UNCERTAIN, NO_LINE = "deleted", "pose uncertain", "no line in the window"
-CONTRADICTED = "the pictures disagree with the map"
+DELETED, NO_LINE = "deleted", "no line in the window"
+DOUBTFUL = "likely to be wrong"
 BETWEEN_LANES = "on the line between two lanes, or in a swerve beyond it"
 #: A wrong map puts the car there, too; so these frames count against the map.
 AWAY = "far beside the lane"
@@ -65,19 +62,6 @@ class MappedDrive:
     drive: Drive
     rows: Int[np.ndarray, "n"]
     perception: PerceptionSettings
-
-    @cached_property
-    def certain(self) -> Bool[np.ndarray, "n"]:
-        """Frames whose edges match the map.
-
-        Where a run of frames starts, there is no map to match yet; its first frame is as certain as the next.
-        Without edges, nothing says where a frame is.
-        """
-        match = self.drive_map.match
-        following = np.append(match[1:], np.nan)
-        following[:-1][self.starts[1:]] = np.nan
-        match = np.where(np.isnan(match) & self.starts, following, match)
-        return np.asarray(match >= _MIN_MATCH)
 
     @cached_property
     def starts(self) -> Bool[np.ndarray, "n"]:
@@ -225,15 +209,13 @@ def label_frame(
 ) -> tuple[FrameLines, Float[np.ndarray, "6"]] | str:
     """Return the lane of the map's k-th frame and its six labels, or the reason why it has none.
 
-    A frame has no labels if the driver deleted it, if its pose is uncertain (few edges match the map), if the
-    car is between two lanes or far beside its own, or if the images contradict both lines. A point is masked
-    if the images contradict its line there or in this frame, if the map does not support it, or if it lies
-    outside the window.
+    A frame has no labels if the driver deleted it, if the car is between two lanes or far beside its own, or
+    if all its labels are likely to be wrong (:attr:`lanenet.data.maps.label_errors.LabelErrors.withheld`). A
+    point is masked if it is likely to be wrong, if the map does not support it, or if it lies outside the
+    window.
     """
     if mapped.drive.deleted[mapped.rows[k]]:
         return DELETED
-    if not mapped.certain[k]:
-        return UNCERTAIN
     if mapped.drive_map.lanes.between[k]:
         return BETWEEN_LANES
     if mapped.drive_map.lanes.away[k]:
@@ -242,9 +224,9 @@ def label_frame(
     visible = window.labelled(seen.points_cm)
     if not np.isfinite(visible).any():
         return NO_LINE
-    seen = seen.without(mapped.drive_map.contradicted[k])
+    seen = seen.without(mapped.drive_map.errors.withheld[k])
     visible = window.labelled(seen.points_cm)
-    return (seen, visible) if np.isfinite(visible).any() else CONTRADICTED
+    return (seen, visible) if np.isfinite(visible).any() else DOUBTFUL
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +260,8 @@ def label_frames(mapped: MappedDrive, window: BirdseyeWindow) -> MapLabels:
             lines[k], points_cm[k] = labelled
         if reasons[k] not in NOT_TO_LABEL:
             in_window[k] = points_in_window(mapped.drive_map, k, window)
-        # A wrong map puts lines there, too, but images around the frame contradict it.
-        if reasons[k] == NO_LINE and not (in_window[k].any() or mapped.drive_map.contradicted[k].any()):
+        # A wrong map puts lines there, too, but then its labels are doubted.
+        if reasons[k] == NO_LINE and not (in_window[k].any() or mapped.drive_map.errors.withheld[k].all()):
             reasons[k] = OUTSIDE
     return MapLabels(reasons, lines, points_cm, in_window)
 

@@ -21,6 +21,7 @@ from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.exports import EXPORTS, export_labels
 from lanenet.data.label_set import LabelSet, read_labels, write_labels
 from lanenet.data.maps.folder import DriveMap, write_map
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.tables import write_csv
 from lanenet.errors import ConfigError, DriveFormatError, LabelFormatError, LanenetError
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM
@@ -48,11 +49,12 @@ def made(tmp_path: Path) -> tuple[Path, Path, LabelSet, DriveMap]:
             "match",
             "tilt_rad",
             "held_out",
-            "contradicted",
         )
     }
     meta = whole.meta.model_copy(update={"drive": str(tmp_path / "d")})
-    lane = replace(whole, meta=meta, frames=np.arange(N), lines={0: whole.lines[0]}, **cut)
+    lane = replace(
+        whole, meta=meta, frames=np.arange(N), lines={0: whole.lines[0]}, errors=LabelErrors.none(N), **cut
+    )
     write_map(tmp_path / "map", lane, {"frame": np.arange(3)}, {"frames": N}, "by hand")
     (tmp_path / "map" / "settings.yaml").write_text("{}\n")
     labels = make_label_set(N, 3, camera_hash=CAMERA.hash)

@@ -25,16 +25,16 @@ from lanenet.data.drives.content import image_marks
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import read_labels, write_labels
 from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, read_map, write_map
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.data.maps.mapped_drive import (
     AWAY,
     BETWEEN_LANES,
-    CONTRADICTED,
     DELETED,
+    DOUBTFUL,
     NO_LINE,
     NOT_TO_LABEL,
     OUTSIDE,
-    UNCERTAIN,
     known_lines,
     label_frame,
     label_frames,
@@ -48,6 +48,7 @@ from lanenet.errors import CalibrationError, ConfigError, DriveFormatError, MapF
 from lanenet.evaluation.sources import open_tests
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera, Mounting
+from lanenet.geometry.lane import ROWS_CM
 from lanenet.perception.edges.road import PerceptionSettings, RangeSettings
 from lanenet.viewers.mapped import MapToSee
 
@@ -67,6 +68,13 @@ def straight_line(side: Side, y_cm: float) -> LaneLine:
     return LaneLine(side, knots, np.column_stack([s, np.full(13, y_cm)]), supported, 0.1)
 
 
+def doubted(frame: int, point: slice | int = slice(None)) -> LabelErrors:
+    """Errors by which one label of a frame is withheld, or several."""
+    wrong = np.zeros((len(MAPPED), 6), dtype=bool)
+    wrong[frame, point] = True
+    return LabelErrors.withholding(wrong)
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """The car drives along +x, 2 cm to the left of the middle of the lane."""
@@ -78,7 +86,6 @@ def folder(tmp_path: Path) -> Path:
     s_cm = 1.0 * MAPPED
     match = np.full(n, 0.6)
     match[[0, 12]] = np.nan
-    match[5] = 0.05
     lines = [straight_line("left", 18.0), straight_line("right", -22.0)]
     drive_map = DriveMap(
         meta=MapMeta(
@@ -101,7 +108,7 @@ def folder(tmp_path: Path) -> Path:
         lines={0: lines, 1: lines},
         tilt_rad=np.zeros((n, 2)),
         held_out=np.zeros(n, dtype=bool),
-        contradicted=np.zeros((n, 2), dtype=bool),
+        errors=doubted(5),
     )
     out = tmp_path / "map"
     out.mkdir()
@@ -298,10 +305,8 @@ def test_a_test_part_is_opened_with_its_own_frames_only(folder, tmp_path):
 def test_why_a_frame_gets_no_labels(folder):
     mapped = open_mapped_drive(folder)
     window = BirdseyeWindow()
-    assert label_frame(mapped, 5, window) == UNCERTAIN
-    assert not isinstance(label_frame(mapped, 6, window), str)
-    contradicting = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, 6])
-    assert label_frame(replace(mapped, drive_map=contradicting), 6, window) == CONTRADICTED
+    assert label_frame(mapped, 5, window) == DOUBTFUL
+    # The first one matches no map yet.
     assert not isinstance(label_frame(mapped, 0, window), str)
     dashed = [replace(line, unpainted=0.4) for line in mapped.drive_map.lines[0][:1]]
     on_dashes = replace(
@@ -321,22 +326,11 @@ def test_why_a_frame_gets_no_labels(folder):
     assert not isinstance(label_frame(replace(mapped, drive=deleted), 13, window), str)
 
 
-def test_lines_beside_the_window_count_against_a_map_only_where_images_contradict_it(folder):
+def test_lines_beside_the_window_count_against_a_map_only_where_it_is_doubted(folder):
     mapped, window = open_mapped_drive(folder), BirdseyeWindow(left_cm=100.0)
     assert label_frames(mapped, window).reasons[3] == OUTSIDE
     assert OUTSIDE in NOT_TO_LABEL
-    contradicting = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [3, -1])
-    assert label_frames(replace(mapped, drive_map=contradicting), window).reasons[3] == NO_LINE
-
-
-def test_a_frame_without_edges_is_uncertain_unless_it_is_the_first(folder):
-    mapped, window = open_mapped_drive(folder), BirdseyeWindow()
-    match = mapped.drive_map.match.copy()
-    match[[7, 13]] = np.nan
-    lost = replace(mapped, drive_map=replace(mapped.drive_map, match=match))
-    reasons = [label_frame(lost, k, window) for k in (0, 7, 8, 12, 13)]
-    # The 12th frame starts a segment, but the next one says nothing of where it is.
-    assert [reason == UNCERTAIN for reason in reasons] == [False, True, False, True, True]
+    assert label_frames(mapped, window).reasons[5] == NO_LINE
 
 
 def test_the_rows_that_lie_in_a_contradicted_section_get_no_labels(folder):
@@ -352,25 +346,32 @@ def test_the_rows_that_lie_in_a_contradicted_section_get_no_labels(folder):
     assert points_in_window(withheld.drive_map, 6, BirdseyeWindow())[:3].all()
 
 
-def test_a_line_that_is_contradicted_gets_no_labels_and_the_other_one_does(folder):
-    mapped = open_mapped_drive(folder)
-    whole = label_frame(mapped, 6, BirdseyeWindow())
-    assert not isinstance(whole, str)
-    for side, name in enumerate(("left_cm", "right_cm")):
-        contradicted = np.zeros((len(MAPPED), 2), dtype=bool)
-        contradicted[6, side] = True
-        contradicting = replace(mapped, drive_map=replace(mapped.drive_map, contradicted=contradicted))
-        masked = label_frame(contradicting, 6, BirdseyeWindow())
-        assert not isinstance(masked, str)
-        own, others = np.split(np.arange(6), 2)[:: 1 - 2 * side]
-        assert np.isnan(masked[1][own]).all()
-        np.testing.assert_array_equal(masked[1][others], whole[1][others])
-        # The whole line goes, or a shifted view would get labels of it.
-        assert np.isnan(getattr(masked[0], name)).all() and np.isfinite(getattr(whole[0], name)).any()
-    # Nothing is left where the other line is not known.
-    far = BirdseyeWindow(left_cm=-48.0, columns=64)
-    contradicting = replace(mapped.drive_map, contradicted=np.arange(len(MAPPED))[:, None] == [6, -1])
-    assert label_frame(replace(mapped, drive_map=contradicting), 6, far) == CONTRADICTED
+@pytest.mark.parametrize("point", range(6))
+def test_a_label_that_is_doubted_is_masked_with_its_piece_of_the_line(folder, point):
+    mapped, window = open_mapped_drive(folder), BirdseyeWindow()
+    whole = label_frame(mapped, 0, window)
+    doubting = replace(mapped, drive_map=replace(mapped.drive_map, errors=doubted(0, point)))
+    masked = label_frame(doubting, 0, window)
+    assert not isinstance(whole, str) and not isinstance(masked, str)
+    others = np.arange(6) != point
+    assert np.isfinite(whole[1]).all() and np.isnan(masked[1][point])
+    np.testing.assert_array_equal(masked[1][others], whole[1][others])
+    # The line goes up to half-way to the next labels, or a shifted view would get labels of it.
+    lines, before = ((frame.left_cm, frame.right_cm) for frame in (masked[0], whole[0]))
+    own, row_cm = point // 3, ROWS_CM[point % 3]
+    np.testing.assert_array_equal(lines[1 - own], before[1 - own])
+    y_cm = before[own][:, 1]
+    nearest = np.abs(y_cm[:, None] - np.array(ROWS_CM)).min(axis=1) == np.abs(y_cm - row_cm)
+    np.testing.assert_array_equal(
+        np.isnan(lines[own]).all(axis=1), nearest | np.isnan(before[own]).all(axis=1)
+    )
+
+
+def test_nothing_is_left_where_the_line_is_doubted_and_the_other_lies_beside_the_window(folder):
+    mapped, far = open_mapped_drive(folder), BirdseyeWindow(left_cm=-48.0, columns=64)
+    doubting = replace(mapped, drive_map=replace(mapped.drive_map, errors=doubted(6, slice(3))))
+    assert not isinstance(label_frame(mapped, 6, far), str)
+    assert label_frame(doubting, 6, far) == DOUBTFUL
 
 
 def test_a_frame_lacks_a_line_that_ends_before_its_first_label_row(folder):

@@ -96,7 +96,7 @@ def test_a_rescaled_map_is_the_map_of_the_other_width(drive: Path, tmp_path: Pat
     assert reports[0].pop("rescaled") == reports[0]["notes"].pop(0) and not reports[1].pop("rescaled")
     assert_same(*reports)
     maps = [read_map(folder) for folder in (one, other)]
-    for name in ("poses", "s_cm", "match", "tilt_rad", "lap", "segment", "held_out", "contradicted"):
+    for name in ("poses", "s_cm", "match", "tilt_rad", "lap", "segment", "held_out", "errors"):
         np.testing.assert_allclose(getattr(maps[0], name), getattr(maps[1], name), SAME, SAME)
     assert_same(*(each.meta.model_dump() for each in maps))
     assert_same(*(vars(each.camera.mounting) for each in maps))
@@ -213,7 +213,8 @@ def test_every_length_of_a_map_is_scaled():
         drive_map, np.arange(n), LaneWidth(36.4, 38.0, (30.0, 40.0)), edges, drive_map.poses, [figures], 35.0
     )
     twice = assembled.scaled(2.0, {})
-    same_meta = {"format", "drive", "scale_from", "laps", "markings", "verdict", "ahead_sigma_cm", "options"}
+    same_meta = {"format", "drive", "scale_from", "laps", "markings", "verdict", "state", "ahead_sigma_cm",
+                 "options"}  # fmt: skip
     for name, value in drive_map.meta.model_dump().items():
         assert getattr(twice.drive_map.meta, name) == (value if name in same_meta else 2.0 * value), name
     assert twice.lane == LaneWidth(72.8, 76.0, (60.0, 80.0)) and twice.free_lane_cm == 70.0
@@ -230,7 +231,7 @@ def test_every_length_of_a_map_is_scaled():
     camera = twice.drive_map.camera
     assert (camera.mounting.height_cm, camera.wheelbase_cm) == (30.0, 17.0)
     assert camera.mounting.ahead_of_front_axle_cm == 2.0 * (17.0 - 3.5) - 17.0
-    same = {"frames", "t_s", "lap", "segment", "match", "tilt_rad", "held_out", "contradicted", "marks"}
+    same = {"frames", "t_s", "lap", "segment", "match", "tilt_rad", "held_out", "errors", "marks"}
     for name, value in vars(drive_map).items():
         if name in same:
             np.testing.assert_array_equal(getattr(twice.drive_map, name), value)

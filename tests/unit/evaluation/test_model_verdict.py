@@ -10,6 +10,7 @@ import pytest
 from small_map import CAMERA, N, small_map
 
 from lanenet.data.maps.folder import write_map
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.evaluation.comparison import Comparison, SeenSource, SourceAnswers, compare_detectors
 from lanenet.evaluation.tables import lay_out, main_table
@@ -38,10 +39,11 @@ def test_a_model_without_large_errors_needs_half_a_sentence():
 
 @pytest.mark.parametrize(("row", "doubted"), [(9, True), (29, False)])
 def test_the_worst_frame_is_named_and_the_maps_own_doubt_there(tmp_path: Path, row: int, doubted: bool):
-    """The small map is contradicted in its frames 108 to 115."""
+    """The small map doubts its frames 108 to 115; what cannot be judged is no doubt."""
     drive_map = small_map()
     if not doubted:
-        drive_map = replace(drive_map, contradicted=np.zeros((N, 2), bool))
+        unknown = np.where(np.arange(6) == 3, np.nan, np.zeros((N, 6)))
+        drive_map = replace(drive_map, errors=LabelErrors(unknown, unknown, unknown))
     write_map(tmp_path / "m", drive_map, {"frame": np.arange(2)}, {}, "given")
     answers = TRUTH + 0.5
     answers[row, 2] += 12.0
@@ -49,7 +51,7 @@ def test_the_worst_frame_is_named_and_the_maps_own_doubt_there(tmp_path: Path, r
     said = verdict_sentence(*compared(answers, str(tmp_path / "m")), "here")
     assert f"the worst near frame {100 + row} by 12.5 cm" in said and "answers 92 % of" in said
     assert "0.61 % of its answers are off by more than 4 cm" in said
-    assert ("contradict the map itself" in said) == doubted
+    assert ("map itself is in doubt" in said) == doubted
 
 
 def test_a_model_that_answers_nothing_has_no_median():

@@ -18,6 +18,7 @@ from datagen.slam.camera.coarse import guessed_camera
 from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
+from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.perception.edges.road import PerceptionSettings
 
@@ -56,7 +57,7 @@ def mapped() -> MappedDrive:
         lines={},
         tilt_rad=np.zeros((n, 2)),
         held_out=np.zeros(n, dtype=bool),
-        contradicted=np.zeros((n, 2), dtype=bool),
+        errors=LabelErrors.none(n),
     )
     drive = Drive(
         name="made-up",

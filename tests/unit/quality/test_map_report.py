@@ -30,7 +30,9 @@ from lanenet.data.maps.folder import read_map
 from lanenet.errors import TrackingLostError
 
 FRAMES = 80
-SETTINGS = MapSettings(find_bumper=False)
+#: Of a set that is small enough for a test.
+LEAST = {"min_frames": 60, "min_metres": 2.0}
+SETTINGS = MapSettings(find_bumper=False, verdict=VerdictSettings.model_validate(LEAST))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,9 @@ def mapped(drive: Path) -> tuple[Path, tuple[str, ...]]:
 def test_a_clean_drive_is_good_and_says_so_first(mapped):
     folder, lines = mapped
     assert lines[0].startswith("verdict: good: ")
-    assert read_map(folder).meta.verdict == "good"
+    meta = read_map(folder).meta
+    # The road does not close, which its labels need not.
+    assert (meta.verdict, meta.state) == ("good", "open")
 
 
 def test_without_pictures_the_map_is_the_same(drive, mapped, tmp_path):
@@ -94,7 +98,12 @@ def test_figures_for_machines(mapped):
     assert report["labelled"]["share"] == pytest.approx(
         1.0 - sum(report["labelled"]["why_not"].values()) / FRAMES
     )
-    assert report["verdict"]["grade"] == "good"
+    assert (report["verdict"]["grade"], report["verdict"]["state"]) == ("good", "open")
+    # Labels as the verdict counts them, and as the map gives them.
+    assert report["labels"]["labelled"] == round(report["labelled"]["share"] * report["labels"]["frames"])
+    errors = read_map(folder).errors
+    assert (np.isfinite(errors.off_3).mean(axis=0) > 0.5).all()
+    assert report["labels"]["off_3"] == pytest.approx(errors.off_3[~errors.withheld].mean(), abs=1e-3)
 
 
 class _Page(HTMLParser):
@@ -145,7 +154,7 @@ def test_held_out_frames_have_no_say_in_the_lines(drive, mapped, tmp_path):
 
 def test_a_rejected_map_shows_three_findings_and_what_works_without_it(drive, tmp_path):
     """The rest is folded; a remedy that sends to the strip of frames finds a heading of that name."""
-    strict = VerdictSettings(max_sd_px=1e-6, max_p95_px=1e-6, min_labelled=0.9999, height_cm=(1.0, 2.0))
+    strict = VerdictSettings(min_frames=500, min_metres=50.0, min_bend_m=50.0, max_off=1e-6)
     out = tmp_path / "maps" / "one"
     report = map_drive(MapRequest(drive, 40.0), SETTINGS.model_copy(update={"verdict": strict}), out)
     verdict = report.figures["verdict"]
@@ -187,7 +196,7 @@ def test_a_killed_map_leaves_no_half_of_it_and_runs_again(drive, mapped, tmp_pat
     """Killed early, at random moments, and while the folder is being filled; then as if undisturbed."""
     out = tmp_path / "maps" / "one"
     config = tmp_path / "map.yaml"
-    config.write_text("find_bumper: false\n")
+    config.write_text(yaml.safe_dump({"find_bumper": False, "verdict": LEAST}))
     command = [sys.executable, "-m", "lanenet", "map", str(drive), "--lane-width", "40"]
     command += ["--config", str(config), "--out", str(out)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
