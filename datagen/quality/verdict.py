@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lanenet.config import Settings
 from lanenet.data.maps.mapped_drive import DOUBTFUL
@@ -123,6 +123,13 @@ class MapEvidence:
     pauses: int = 0
 
 
+#: Bounds of earlier versions, with their defaults.
+_OLDER = {
+    "max_sd_px": 0.5, "max_p95_px": 1.5, "min_samples": 50, "min_labelled": 0.85, "min_coverage": 0.3,
+    "max_contradicted": 0.075, "max_withheld": 0.15, "max_tape_ratio": 1.35,
+}  # fmt: skip
+
+
 class VerdictSettings(Settings):
     """Bounds of good labels and of a closed map; ``usable`` ones may exceed a bound by that factor.
 
@@ -180,6 +187,16 @@ class VerdictSettings(Settings):
     tape_cm: tuple[float, float] = (0.8, 10.0)
     height_mismatch: float = Field(default=0.08, gt=0.0)
     tape_mismatch: float = Field(default=0.25, gt=0.0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_older(cls, given: Any) -> Any:
+        """Drop bounds of earlier versions that stand as they were by default: a map's settings hold them all."""
+        if not isinstance(given, dict):
+            return given
+        return {
+            name: value for name, value in given.items() if _OLDER.get(name) != value or name not in _OLDER
+        }
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 
 import pytest
+from pydantic import ValidationError
 
 from datagen.quality.label_error import KINDS
 from datagen.quality.verdict import Check, LabelEvidence, MapEvidence, VerdictSettings, checks, judge
@@ -245,3 +246,9 @@ def test_what_else_there_is_to_know():
     assert judge(KNOWN, VerdictSettings()).remarks == ()
     (compared,) = judged(given_height_cm=18.0).remarks
     assert "18 cm was measured" in compared and "6 % smaller" in compared
+
+
+def test_settings_of_an_older_map_are_read_unless_somebody_chose_a_bound_that_is_gone():
+    assert VerdictSettings.model_validate({"max_sd_px": 0.5, "min_labelled": 0.85}) == VerdictSettings()
+    with pytest.raises(ValidationError, match="min_labelled"):
+        VerdictSettings.model_validate({"min_labelled": 0.5})
