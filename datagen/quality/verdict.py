@@ -191,7 +191,7 @@ class VerdictSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _without_older(cls, given: Any) -> Any:
-        """Drop bounds of earlier versions that stand as they were by default: a map's settings hold them all."""
+        """Drop bounds of earlier versions that stand as by default: a map's settings hold them all."""
         if not isinstance(given, dict):
             return given
         return {
