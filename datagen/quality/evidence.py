@@ -60,11 +60,11 @@ _SMALL_CM = 0.2
 
 
 #: By label; features by name; hits by row, place and column, see :class:`_Line`, and sums of them by label.
-_Ints = Int[np.ndarray, "m"]
-_Floats = Float[np.ndarray, "m"]
-_Features = dict[str, Float[np.ndarray, "_"]]
+_Ints = Int[np.ndarray, "..."]
+_Floats = Float[np.ndarray, "..."]
+_Features = dict[str, Float[np.ndarray, "..."]]
 _Hits = UInt8[np.ndarray, "l t b"] | Int[np.ndarray, "l t b"]
-_Sums = Int[np.ndarray, "m b"]
+_Sums = Int[np.ndarray, "_ _"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +363,7 @@ def _labels(drive_map: DriveMap, one: _Line) -> _Labels:
 
 def _profile(sums: Int[np.ndarray, "m b"], usual: Float[np.ndarray, "m d"]) -> _Profile:
     """Sum up a profile, given sums of hits; ``usual`` is the share of hits where the line is met."""
-    views, sides = sums[:, -1], sums[:, :-1].reshape(len(sums), 2, -1).astype(np.float64)
+    views, sides = sums[:, -1], sums[:, :-1].reshape(len(sums), 2, sums.shape[1] // 2).astype(np.float64)
     d_cm = (np.arange(sides.shape[2]) - sides.shape[2] // 2) * _BIN_CM
     close = np.abs(d_cm) <= _OFFSET_CM
     # Squared, so that the peak counts.
@@ -415,7 +415,11 @@ def _evidence(
     j = of_row[near[k]]
     cell, base = one.cell(labels.s_cm), one.cell(one.s_cm[one.looked[j]])
     at, label_pass = cell % one.count, passes[k] + cell // one.count
-    centre = one.sign[one.looked[j]] * (cell - base) - 1
+    # On a lap the nearest frame may be beyond the seam.
+    beyond = (
+        cell - base - (one.count * np.rint((cell - base) / one.count).astype(np.int64) if one.closed else 0)
+    )
+    centre = one.sign[one.looked[j]] * beyond - 1
     apart = np.abs(np.arange(cells.shape[1]) - centre[:, None]) + 1e6 * (one.hits[j, :, -1] == 0)
     gap = np.where((j < 0) | (apart.min(axis=1) > 1e5), np.nan, apart.min(axis=1))
     own_sums = _window(one.hits, j, np.where(gap > _OWN, apart.argmin(axis=1), centre), _OWN)

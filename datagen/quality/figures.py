@@ -214,7 +214,8 @@ def map_evidence(
         wrong=tuple(withheld_text(place) for place in figures["withheld"]["places"]),
         wrong_share=figures["withheld"]["share"],
         revisits=revisits,
-        laps=meta.laps,
+        laps=max(meta.laps, int(np.ptp(drive_map.poses[:, 2]) / (2.0 * np.pi))),
+        comes_round=all(segment["closed"] for segment in figures["segments_mapped"]),
         closure_across_heights=sum(cm * count for cm, count in across) / revisits / height_cm
         if revisits
         else None,

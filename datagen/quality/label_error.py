@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from datagen.quality.evidence import LabelFeatures
-from lanenet.data.maps.label_errors import LabelErrors
+from lanenet.data.maps.label_errors import MAX_OFF_1, MAX_OFF_3, LabelErrors
 
 #: File of the trees, beside this module.
 MODEL_NAME = "label_error.npz"
@@ -108,17 +108,22 @@ def doubted_by(
     """Share of the withheld labels by the kind of evidence that speaks most against each, the largest first.
 
     That is the kind without which the label would be doubted least: with values as given labels have them.
+    What is not seen has no place beside the line either.
     """
     rows = features.values[errors.withheld & np.isfinite(features.s_cm)]
     if not len(rows) or not given.any():
         return {}
     rows = rows[:: len(rows) // _MOST_EXPLAINED + 1]
     known = (column[np.isfinite(column)] for column in features.values[given].T)
-    usual = np.array([np.median(column) if len(column) else np.nan for column in known])
+    usual = np.array([np.median(column) if len(column) else np.nan for column in known], np.float32)
+    beside = np.array([any(part in name for part in KINDS["beside"]) for name in features.names])
     without = []
     for parts in KINDS.values():
-        kind = np.array([any(part in name for part in parts) for name in features.names])
-        without.append(_predict(features.names, np.where(kind, usual, rows))[2])
+        mine = np.array([any(part in name for part in parts) for name in features.names])
+        unseen = np.isnan(rows) & beside
+        kind = (mine & ~unseen) | (unseen if parts is KINDS["unseen"] else False)
+        _, off_1, off_3 = _predict(features.names, np.where(kind, usual, rows))
+        without.append(np.maximum(off_1 / MAX_OFF_1, off_3 / MAX_OFF_3))
     counts = np.bincount(np.argmin(without, axis=0), minlength=len(KINDS))
     shares = zip(KINDS, (counts / len(rows)).tolist(), strict=True)
     return dict(sorted(((name, share) for name, share in shares if share), key=lambda item: -item[1]))

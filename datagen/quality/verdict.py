@@ -70,7 +70,8 @@ class MapEvidence:
         coverage: Share of the lines' borders in view of held-out frames that met an edge; NaN if no frame was
             held out.
         revisits: Number of revisits.
-        laps: Laps driven.
+        laps: Whole turns that the car has driven, or laps between revisits where these are more.
+        comes_round: Whether the road of every segment ends where it begins.
         closure_across_heights: Median error of the revisits across the road, in camera heights; None without
             a revisit.
         camera_known: Whether the camera was given.
@@ -106,6 +107,7 @@ class MapEvidence:
     given_lane_cm: float
     found_lane_cm: float | None
     laps: int = 0
+    comes_round: bool = True
     strain: float = 0.0
     bend_lane_cm: float | None = None
     open_lane_cm: tuple[float, float] | None = None
@@ -261,7 +263,7 @@ class Check(NamedTuple):
         found = self.what.format(self._number(self.value))
         return f"{found}, expected {self._number(self.good)} {end}{beyond} ({self.name})"
 
-    def _number(self, value: float) -> str:
+    def _number(self, value: float | int) -> str:
         if self.unit == "%":
             return f"{100.0 * value:.3g} %"
         return f"{value:.3g}{' ' if self.unit else ''}{self.unit}"
@@ -280,9 +282,16 @@ _USUAL_HEIGHT_CM, _USUAL_TAPE_CM = (10.0, 22.0), (1.4, 5.5)
 #: Share of the frames without labels from which on their cause is told, and ratio of the widths of a line's
 #: tape. Measured: 1.05 to 1.2 on three real drives on flat floors.
 _TOLD, _TOLD_TAPE_RATIO = 0.15, 1.35
+#: Factor on the share of wrong labels up to which a set is usable, 2 %. Chosen: a robust loss takes it.
+_USABLE_OFF = 4.0
 #: Sections of the lines that are wrong, as a share of their length, beyond which the map is. Chosen: one
 #: section of 10 cm in 10 m.
 _WRONG_SHARE = 0.01
+_PAUSED = (
+    "the recording has {} pauses, as where it runs only while the throttle is pressed: record all of the "
+    "drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)"
+)
+_LOOK = "look at the strip of frames in the report"
 #: Why labels are doubted, by kind of evidence (:data:`datagen.quality.label_error.KINDS`): cause and remedy.
 _DOUBTS = {
     "gaps": (
@@ -351,8 +360,8 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
     if e.segments > 1:
         return "open", f": its {e.segments} segments show no place of each other"
     if not e.revisits:
-        return "open", ": no place was seen twice"
-    return "closed", ""
+        return "open", ": no place was certainly seen twice"
+    return ("closed", "") if e.comes_round else ("open", ": the road does not come round")
 
 
 def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
@@ -375,7 +384,8 @@ def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
         return
     yield Check(
         "max_off", "{} of the labels are expected to be off by more than 3 cm", labels.off_3, s.max_off,
-        4.0 * s.max_off, "too many labels are expected to be wrong", _why_not(e)[1],
+        _USABLE_OFF * s.max_off, "too many labels are expected to be wrong",
+        "look at the worst frames in the report; where the map is wrong, drive another lap",
     )  # fmt: skip
     for name, what, value, least, unit in (
         ("min_frames", "{} frames have labels", labels.labelled, s.min_frames, ""),
@@ -415,17 +425,15 @@ def _why_not(e: MapEvidence) -> tuple[str, str]:
     labels = e.labels
     kind = next(iter(labels.doubted), "")
     reason, count = next(iter(labels.not_labelled.items()), ("", 0))
-    if e.pauses and kind in ("", "gaps", "line", "beside"):
-        return (
-            "they lie beside pauses of the recording, where the car's pose is uncertain",
-            f"the recording has {e.pauses} pauses, as where it runs only while the throttle is pressed: "
-            "record all of the drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)",
-        )
     # What speaks against labels is no cause where frames lack them for another reason.
     if kind in _DOUBTS and reason in ("", DOUBTFUL) and not (kind == "camera" and e.camera_known):
-        return _DOUBTS[kind]
+        cause, remedy = _DOUBTS[kind]
+        if kind == "gaps" and e.pauses:
+            cause = "they lie beside pauses of the recording, where the car's pose is uncertain"
+            remedy = _PAUSED.format(e.pauses)
+        return cause, _LOOK if kind == "line" and e.laps >= 2 else remedy
     cause = f"{count} lack them ({reason})" if reason else "unknown"
-    return cause, "look at the strip of frames in the report"
+    return cause, _LOOK
 
 
 def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
@@ -558,6 +566,8 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
         yield f"most of the {_percent(missing)} of frames without labels: {cause}" + (
             f"; {remedy}" if remedy else ""
         )
+    if e.pauses and _PAUSED.format(e.pauses) != _why_not(e)[1]:
+        yield _PAUSED.format(e.pauses)
     if e.tape_range_cm is not None and e.tape_range_cm[1] > _TOLD_TAPE_RATIO * e.tape_range_cm[0]:
         low, high = e.tape_range_cm
         yield (

@@ -22,12 +22,22 @@ from datagen.quality.label_error import BOUNDS_CM, Trees
 FOLDS, SEED = 5, 0
 #: Features with which an error can only become more, or less, likely.
 MORE = ("rival", "offset_cm", "apart_cm", "shift_cm", "sigma_cm", "ahead_cm", "focal_cm", "pitch_cm",
-        "bridged_cm", "gap_to_view_cm", "one_border_cm", "width_off", "sideways_cm")  # fmt: skip
+        "bridged_cm", "one_border_cm", "width_off", "sideways_cm")  # fmt: skip
 LESS = ("_met", "_both")
 TREES = {"max_iter": 80, "learning_rate": 0.08, "max_leaf_nodes": 12, "min_samples_leaf": 150,
          "l2_regularization": 20.0, "max_features": 0.5, "random_state": SEED}  # fmt: skip
 #: Bounds of the probabilities, of errors beyond 1 and 3 cm, whose price is printed.
-TRIED = ((1.0, 1.0), (0.5, 0.1), (0.5, 0.05), (0.3, 0.05), (0.3, 0.03), (0.3, 0.02), (0.3, 0.01), (0.2, 0.01))
+TRIED = (
+    (1.0, 1.0),
+    (0.5, 0.1),
+    (0.5, 0.05),
+    (0.5, 0.03),
+    (0.3, 0.05),
+    (0.3, 0.03),
+    (0.3, 0.02),
+    (0.3, 0.01),
+    (0.2, 0.01),
+)
 #: Errors below this are alike, [cm].
 LEAST_CM = 0.05
 

@@ -261,7 +261,7 @@ def label_frames(mapped: MappedDrive, window: BirdseyeWindow) -> MapLabels:
         if reasons[k] not in NOT_TO_LABEL:
             in_window[k] = points_in_window(mapped.drive_map, k, window)
         # A wrong map puts lines there, too, but then its labels are doubted.
-        if reasons[k] == NO_LINE and not (in_window[k].any() or mapped.drive_map.errors.withheld[k].all()):
+        if reasons[k] == NO_LINE and not (in_window[k].any() or mapped.drive_map.errors.doubted[k].any()):
             reasons[k] = OUTSIDE
     return MapLabels(reasons, lines, points_cm, in_window)
 

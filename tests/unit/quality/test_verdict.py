@@ -68,12 +68,12 @@ def test_a_good_set_has_no_findings():
 ROWS = [
     ("max_off", lambda x: {"off_3": x}, S.max_off, 4.0 * S.max_off),
     ("max_outside", lambda x: {"outside_share": x}, S.max_outside, 2.0 * S.max_outside),
-    ("min_frames", lambda x: {"labelled": x}, S.min_frames, S.min_frames // 10),
+    ("min_frames", lambda x: {"labelled": round(x)}, S.min_frames, S.min_frames // 10),
     ("min_metres", lambda x: {"metres": x}, S.min_metres, 0.1 * S.min_metres),
     ("min_bend_m", lambda x: {"left_m": 0.1, "right_m": x - 0.1}, S.min_bend_m, None),
     ("min_in_view", lambda x: {"in_view": x}, S.min_in_view, None),
     ("max_closure_heights", lambda x: {"closure_across_heights": x}, S.max_closure_heights, None),
-    ("min_revisits", lambda x: {"revisits": x}, S.min_revisits, S.min_revisits // 2),
+    ("min_revisits", lambda x: {"revisits": round(x)}, S.min_revisits, S.min_revisits // 2),
     ("max_strain", lambda x: {"strain": x}, S.max_strain, 2.0 * S.max_strain),
     ("max_focal_sigma", lambda x: {"sigma": {"focal": x}}, S.max_focal_sigma, 2.0 * S.max_focal_sigma),
     (
@@ -219,9 +219,10 @@ def test_only_a_drive_with_pauses_is_told_of_them(kind):
     changes = {**FEW, "doubted": {kind: 0.9, "unseen": 0.1} if kind else {}}
     for more in ({}, {"off_3": 0.1}, {"labelled": 0}):
         assert "pause" not in judged(**{**changes, **more}).sentence
-    # They make lines wrong, too, but not glare or a camera.
-    told = judged(**changes, pauses=82).sentence
-    assert ("82 pauses" in told and "AUTO_RECORD_ON_THROTTLE" in told) == (kind not in ("camera", "unseen"))
+    told = judged(**changes, pauses=82)
+    assert ("AUTO_RECORD_ON_THROTTLE" in told.sentence) == (kind == "gaps")
+    # Once, but in any case.
+    assert sum("82 pauses" in text for text in (told.sentence, *told.remarks)) >= 1
 
 
 def test_each_kind_of_doubt_has_a_cause_of_its_own_where_labels_lack_for_it():
