@@ -83,11 +83,11 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     figures = map_figures(drive_map, assembled.segments)
     notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
-    mapped, quality, withheld = compare_with_frames(mapped, camera_figures)
-    figures["withheld"] = withheld
+    mapped, quality = compare_with_frames(mapped, camera_figures)
     drive_map = mapped.drive_map
     check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
     figures |= quality_figures(quality)
+    figures["withheld"] = withheld_figures(drive_map, quality)
     figures["lane_width"] = asdict(assembled.lane)
     steering = steering_answer(mapped)
     figures["steering_correlation"] = None if steering is None else steering.correlation
@@ -111,12 +111,8 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
 
 def compare_with_frames(
     mapped: MappedDrive, camera_figures: dict[str, Any]
-) -> tuple[MappedDrive, MapQuality, dict[str, Any]]:
-    """Predict the errors of a map's labels, mark where it is wrong, and measure it in held-out frames.
-
-    Returns:
-        The map with these errors, what its frames show, and the figures of the sections that are wrong.
-    """
+) -> tuple[MappedDrive, MapQuality]:
+    """Predict the errors of a map's labels, mark where it is wrong, and measure it in held-out frames."""
     drive_map = mapped.drive_map
     features = label_features(mapped, camera_figures)
     errors = predict_errors(features)
@@ -128,8 +124,7 @@ def compare_with_frames(
     mapped = replace(mapped, drive_map=replace(drive_map, lines=lines, errors=errors))
     quality = measure_map(mapped)
     doubted = doubted_by(features, errors, np.isfinite(quality.points_cm))
-    withheld = withheld_figures(drive_map, wrong, share)
-    return mapped, replace(quality, wrong=tuple(wrong), doubted=doubted), withheld
+    return mapped, replace(quality, wrong=tuple(wrong), wrong_share=share, doubted=doubted)
 
 
 def _sections(wrong: Sequence[WrongSection], segment: int, index: int) -> Float[np.ndarray, "w 2"]:

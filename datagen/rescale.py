@@ -18,7 +18,6 @@ from datagen.lanes.scale import LaneWidth
 from datagen.prepare import PreparedDrive
 from lanenet.config import read_yaml
 from lanenet.data.maps.folder import read_map
-from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.tables import ParquetTable
 from lanenet.errors import LanenetError, MapFormatError
 from lanenet.reading import parsing, read_json
@@ -86,13 +85,8 @@ def _read(folder: Path, prepared: PreparedDrive) -> tuple[AssembledMap | None, d
         return None, report
     # Lines that were withheld are looked at again, and so is each frame.
     unmarked = replace(
-        drive_map,
+        drive_map.without_doubts(),
         meta=drive_map.meta.model_copy(update={"verdict": None, "state": None}),
-        errors=LabelErrors.none(len(rows)),
-        lines={
-            number: [replace(line, contradicted_cm=np.empty((0, 2))) for line in lines]
-            for number, lines in drive_map.lines.items()
-        },
         held_out=prepared.held_out[rows],
         marks=tuple(prepared.marks[row] for row in rows.tolist()),
     )

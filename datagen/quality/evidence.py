@@ -27,6 +27,7 @@ from datagen.slam.odometry.scans import lift_tilted
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.maps.mapped_drive import MappedDrive
+from lanenet.geometry.frames import car_from_map
 from lanenet.geometry.lane import N_POINTS, ROWS_CM
 from lanenet.geometry.poses import path_lengths
 
@@ -187,12 +188,8 @@ class _Line:
         self, drive_map: DriveMap, rows: Int[np.ndarray, "r"], s_cm: Float[np.ndarray, "r m"]
     ) -> Float[np.ndarray, "r m 2"]:
         """Points of the line in the car frames of some frames, given as positions in the map."""
-        x, y, heading = (column[:, None] for column in drive_map.poses[rows].T)
-        points = self.line.everywhere(s_cm.ravel())
-        points[~self.line.supported(s_cm.ravel())] = np.nan
-        dx, dy = points[:, 0].reshape(s_cm.shape) - x, points[:, 1].reshape(s_cm.shape) - y
-        c, s = np.cos(heading), np.sin(heading)
-        return np.stack([dx * s - dy * c, dx * c + dy * s - drive_map.camera.wheelbase_cm], axis=-1)
+        points = self.line.points(s_cm.ravel()).reshape(*s_cm.shape, 2)
+        return car_from_map(points, drive_map.poses[rows][:, None], drive_map.camera.wheelbase_cm)
 
 
 def label_features(mapped: MappedDrive, figures: dict[str, Any] | None = None) -> LabelFeatures:
@@ -376,13 +373,21 @@ def _profile(sums: Int[np.ndarray, "m b"], usual: Float[np.ndarray, "m d"]) -> _
     return _Profile(met.mean(axis=1), met.min(axis=1), offset_cm, right_cm - left_cm, rival, views)
 
 
-def _window(hits: _Hits, row: _Ints | int, centre: _Ints, half: int, closed: bool = False) -> _Sums:
+def _running(hits: _Hits) -> Int[np.ndarray, "l t1 b"]:
+    """Sums of hits over the places before each, and over all of them."""
+    return np.cumsum(np.pad(hits, ((0, 0), (1, 0), (0, 0))), axis=1, dtype=np.int32)
+
+
+def _window(running: Int[np.ndarray, "l t1 b"], row: _Ints | int, centre: _Ints, half: int) -> _Sums:
     """Sum the hits of some rows over the places around some centres."""
-    if closed:
-        hits, centre = np.pad(hits, ((0, 0), (half, half), (0, 0)), mode="wrap"), centre + half
-    running = np.cumsum(np.pad(hits, ((0, 0), (1, 0), (0, 0))), axis=1, dtype=np.int32)
-    first, last = (np.clip(centre + by, 0, hits.shape[1]) for by in (-half, half + 1))
+    first, last = (np.clip(centre + by, 0, running.shape[1] - 1) for by in (-half, half + 1))
     return np.asarray(running[row, last] - running[row, first])
+
+
+def _on_line(raster: _Sums, centre: _Ints, closed: bool) -> _Sums:
+    """Sum a raster of a line over the places around some, as far as a pass is looked at."""
+    around = np.pad(raster, ((_PASS, _PASS), (0, 0)), mode="wrap" if closed else "constant")
+    return _window(_running(around[None]), 0, centre + _PASS, _PASS)
 
 
 def _evidence(
@@ -422,16 +427,16 @@ def _evidence(
     centre = one.sign[one.looked[j]] * beyond - 1
     apart = np.abs(np.arange(cells.shape[1]) - centre[:, None]) + 1e6 * (one.hits[j, :, -1] == 0)
     gap = np.where((j < 0) | (apart.min(axis=1) > 1e5), np.nan, apart.min(axis=1))
-    own_sums = _window(one.hits, j, np.where(gap > _OWN, apart.argmin(axis=1), centre), _OWN)
+    ahead_sums = _running(one.hits)
+    own_sums = _window(ahead_sums, j, np.where(gap > _OWN, apart.argmin(axis=1), centre), _OWN)
     own_sums[np.isnan(gap)] = 0
     # Its pass, and all of them.
     pass_sums = np.zeros_like(own_sums)
     for number in np.unique(label_pass):
         now, then = label_pass == number, view_pass == number
-        raster = _raster(place[then], hits[then], one.count)
-        pass_sums[now] = _window(raster[None], 0, at[now], _PASS, one.closed)
-    all_sums = _window(total[None], 0, at, _PASS, one.closed)
-    of_frame = np.where(j[:, None] < 0, 0, _window(one.hits, j, centre, _PASS))
+        pass_sums[now] = _on_line(_raster(place[then], hits[then], one.count), at[now], one.closed)
+    all_sums = _on_line(total, at, one.closed)
+    of_frame = np.where(j[:, None] < 0, 0, _window(ahead_sums, j, centre, _PASS))
     own = _profile(own_sums, usual[at])
     mine = _profile(np.maximum(pass_sums - of_frame, 0), usual[at])
     others = _profile(all_sums - pass_sums, usual[at])

@@ -116,13 +116,15 @@ def doubted_by(
     rows = rows[:: len(rows) // _MOST_EXPLAINED + 1]
     known = (column[np.isfinite(column)] for column in features.values[given].T)
     usual = np.array([np.median(column) if len(column) else np.nan for column in known], np.float32)
-    beside = np.array([any(part in name for part in KINDS["beside"]) for name in features.names])
     without = []
-    for parts in KINDS.values():
-        mine = np.array([any(part in name for part in parts) for name in features.names])
-        unseen = np.isnan(rows) & beside
-        kind = (mine & ~unseen) | (unseen if parts is KINDS["unseen"] else False)
-        _, off_1, off_3 = _predict(features.names, np.where(kind, usual, rows))
+    of_kind = {
+        kind: np.array([any(part in name for part in parts) for name in features.names])
+        for kind, parts in KINDS.items()
+    }
+    unseen = np.isnan(rows) & of_kind["beside"]
+    for kind, mine in of_kind.items():
+        replaced = (mine | unseen) if kind == "unseen" else (mine & ~unseen)
+        _, off_1, off_3 = _predict(features.names, np.where(replaced, usual, rows))
         without.append(np.maximum(off_1 / MAX_OFF_1, off_3 / MAX_OFF_3))
     counts = np.bincount(np.argmin(without, axis=0), minlength=len(KINDS))
     shares = zip(KINDS, (counts / len(rows)).tolist(), strict=True)

@@ -8,7 +8,6 @@ its own, but not errors that all poses share.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -104,6 +103,7 @@ class MapQuality:
         points_cm: Six labels per frame of the map.
         in_window: Which points a complete map would label; none for frames that are not to be labelled.
         wrong: Sections of the lines that are withheld, the longest first.
+        wrong_share: Their share of the length along which the driven lane's lines have labels.
         doubted: See :attr:`datagen.quality.verdict.LabelEvidence.doubted`.
         scale: Reference pixels per pixel, see :func:`datagen.quality.residuals.reference_scale`.
         in_view: Share of the labels whose places lie in the image; NaN without labels.
@@ -116,6 +116,7 @@ class MapQuality:
     points_cm: Float[np.ndarray, "n 6"]
     in_window: Bool[np.ndarray, "n 6"]
     wrong: tuple[WrongSection, ...] = ()
+    wrong_share: float = 0.0
     doubted: dict[str, float] = field(default_factory=dict)
     scale: float = 1.0
     in_view: float = float("nan")
@@ -221,7 +222,7 @@ def wrong_sections(
     return sorted(found, key=lambda one: -one.length_cm), wrong / max(seen, 1.0)
 
 
-def withheld_figures(drive_map: DriveMap, wrong: Sequence[WrongSection], share: float) -> dict[str, Any]:
+def withheld_figures(drive_map: DriveMap, quality: MapQuality) -> dict[str, Any]:
     """Return the report's figures on the sections that are withheld, the longest first."""
     places = [
         {
@@ -231,9 +232,9 @@ def withheld_figures(drive_map: DriveMap, wrong: Sequence[WrongSection], share: 
             "to_cm": one.section_cm[1],
             "frames": [int(drive_map.frames[k]) for k in one.frames],
         }
-        for one in wrong
+        for one in quality.wrong
     ]
-    return {"share": share, "places": places}
+    return {"share": quality.wrong_share, "places": places}
 
 
 def label_evidence(mapped: MappedDrive, quality: MapQuality) -> LabelEvidence:

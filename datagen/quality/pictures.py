@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -215,13 +214,7 @@ def _held_out(mapped: MappedDrive, quality: MapQuality, picks: np.ndarray) -> li
 def withheld_pictures(mapped: MappedDrive, wrong: tuple[WrongSection, ...]) -> list[Picture]:
     """Draw frames that show the longest sections that are withheld, in red."""
     drive_map = mapped.drive_map
-    as_mapped = replace(
-        drive_map,
-        lines={
-            segment: [replace(line, contradicted_cm=np.empty((0, 2))) for line in lines]
-            for segment, lines in drive_map.lines.items()
-        },
-    )
+    as_mapped = drive_map.without_doubts()
     pictures = []
     for place in wrong[:_PICTURES]:
         k = place.frames[len(place.frames) // 2]

@@ -227,7 +227,7 @@ class Check(NamedTuple):
     Attributes:
         name: Of the bound in :class:`VerdictSettings`.
         what: What was found, with a gap for the number.
-        value: The number; NaN is rejected.
+        value: The number; NaN is beyond all bounds.
         good: Bound of good labels.
         usable: Bound of usable ones; None where nothing is rejected.
         cause: What is wrong if it is exceeded, in plain words.

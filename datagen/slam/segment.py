@@ -319,6 +319,12 @@ def _lap(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> tuple[floa
     return float(np.median(between[once])), float(np.median(turned[once]))
 
 
+def _go_around_alike(one: _Closure, other: _Closure) -> bool:
+    """Whether the laps of two closures are as long, and turn as much."""
+    (a_cm, a_rad), (b_cm, b_rad) = (_lap(c.bundle.poses, c.revisits) for c in (one, other))
+    return bool(abs(np.log(a_cm / b_cm)) < _OTHER_LAP and abs(a_rad - b_rad) < _OTHER_TURN_RAD)
+
+
 def shared_misfits(bundles: Sequence[BundleResult]) -> list[float]:
     """Mean robust loss per point in view, over the pairs of frames that all of some adjustments compare."""
     sums = []
@@ -328,7 +334,7 @@ def shared_misfits(bundles: Sequence[BundleResult]) -> list[float]:
         for (a, b), *values in zip(ends, bundle.loss.tolist(), bundle.in_view.tolist(), strict=True):
             found[a, b] = found.get((a, b), np.zeros(2)) + values
         sums.append(found)
-    shared = set(sums[0]).intersection(*sums[1:]) if sums else set()
+    shared = set(sums[0]).intersection(*sums[1:])
     totals = [sum((found[pair] for pair in shared), np.zeros(2)) for found in sums]
     return [float(loss / max(in_view, 1.0)) for loss, in_view in totals]
 
@@ -442,16 +448,11 @@ class _DenseSegment:
                     break
         chosen: list[_Closure] = []
         for one in sorted(found, key=lambda closure: self.cost(closure, opened)):
-            if not any(self.goes_around_like(one, other) for other in chosen):
+            if not any(_go_around_alike(one, other) for other in chosen):
                 chosen.append(one)
         if not self.find_camera:
             chosen = chosen[:1]
         return [self.confirmed_closure(one, opened, matched) for one in chosen]
-
-    def goes_around_like(self, one: _Closure, other: _Closure) -> bool:
-        """Whether the laps of two closures are as long, and turn as much."""
-        (a_cm, a_rad), (b_cm, b_rad) = (_lap(c.bundle.poses, c.revisits) for c in (one, other))
-        return abs(np.log(a_cm / b_cm)) < _OTHER_LAP and abs(a_rad - b_rad) < _OTHER_TURN_RAD
 
     def confirmed_closure(self, closure: _Closure, opened: BundleResult, matched: list[Revisit]) -> _Closure:
         """Close the loops again where the adjusted map tells better which revisits are true.
@@ -534,12 +535,14 @@ class _DenseSegment:
         the camera is that it needs, and what counts between closures that go around alike. The motion's
         priors do not: of the closure that ties the most laps they expect too much.
         """
+        if len(rivals) < 2:
+            return rivals[0] if rivals else None
         agree = shared_misfits([one.bundle for one in rivals])
         costs = [
             len(self.part) * misfit + one.bundle.prior + self.beside_images(one, opened)
             for one, misfit in zip(rivals, agree, strict=True)
         ]
-        return rivals[int(np.argmin(costs))] if rivals else None
+        return rivals[int(np.argmin(costs))]
 
     def grown(
         self, poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], matched: list[Revisit]

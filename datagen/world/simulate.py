@@ -36,7 +36,7 @@ _CHUNK = 16
 #: Tasks per process that may wait: more would only fill the memory.
 _CHUNKS_AHEAD = 2
 #: Of images on disk, when the camera itself does not compress; chosen: hardly any visible loss.
-_FILE_JPEG_QUALITY = 92
+FILE_JPEG_QUALITY = 92
 
 #: Makes a pilot for a world that has just been built.
 BuildPilot = Callable[[World], Pilot]
@@ -210,7 +210,7 @@ def simulate_drive(
     """
     # The file is the camera's own JPEG: compressing twice would change the image.
     world = build_world(settings, compress=False)
-    quality = world.settings.look.jpeg_quality or _FILE_JPEG_QUALITY
+    quality = world.settings.look.jpeg_quality or FILE_JPEG_QUALITY
     writer = DriveWriter(
         out,
         camera=world.camera,
@@ -231,17 +231,21 @@ def simulate_drive(
     bang = BangBang() if world.settings.angles == "bang" else None
     with writer:
         for done, (state, image) in enumerate(frames, start=1):
-            pose = dict(zip(("x_cm", "y_cm", "heading_rad"), map(float, state.pose), strict=True))
-            points = dict(zip(POINT_NAMES, map(float, state.points_cm), strict=True))
             command = recorded_command(world, state)
             if bang is not None:
                 command["angle"] = bang.angle(command["angle"])
-            writer.add(image, state.t_s, truth={**pose, **points}, **command)
+            writer.add(image, state.t_s, truth=true_columns(state), **command)
             if progress is not None:
                 progress(done, total)
         write_track(writer.folder / "track.json", world.track)
         write_text(writer.folder / "simulation.yaml", dump_settings(world.settings))
     return out
+
+
+def true_columns(state: DriveState) -> dict[str, float]:
+    """Columns of the ground truth: pose and six points of a frame."""
+    values = map(float, (*state.pose, *state.points_cm))
+    return dict(zip(("x_cm", "y_cm", "heading_rad", *POINT_NAMES), values, strict=True))
 
 
 def recorded_command(world: World, state: DriveState) -> dict[str, float]:

@@ -57,13 +57,13 @@ def map_from_car(
 
 
 def car_from_map(
-    points_map_cm: Float[np.ndarray, "n 2"], pose: Float[np.ndarray, "3"], wheelbase_cm: float
-) -> Float[np.ndarray, "n 2"]:
-    """Move points from the map to the car frame; inverse of :func:`map_from_car`."""
-    dx = points_map_cm[:, 0] - pose[0]
-    dy = points_map_cm[:, 1] - pose[1]
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.stack([dx * s - dy * c, dx * c + dy * s - wheelbase_cm], axis=1)
+    points_map_cm: Float[np.ndarray, "*n 2"], pose: Float[np.ndarray, "*#n 3"], wheelbase_cm: float
+) -> Float[np.ndarray, "*n 2"]:
+    """Move points from the map to the car frame of one pose, or each of its own; see :func:`map_from_car`."""
+    dx = points_map_cm[..., 0] - pose[..., 0]
+    dy = points_map_cm[..., 1] - pose[..., 1]
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    return np.stack([dx * s - dy * c, dx * c + dy * s - wheelbase_cm], axis=-1)
 
 
 def map_from_car_directions(

@@ -33,16 +33,12 @@ from lanenet.reading import read_json
 SPOILT_SEED = 42_000
 
 
-def projected(drive_map: DriveMap, max_sigma_lanes: float = np.inf) -> Float[np.ndarray, "n 6"]:
-    """Labels of all frames where nothing is withheld, but for lines with a larger sigma than this."""
-
-    def whole(line: LaneLine) -> LaneLine:
-        return replace(line, contradicted_cm=np.empty((0, 2)))
-
-    lines = {segment: [whole(line) for line in found] for segment, found in drive_map.lines.items()}
+def projected(drive_map: DriveMap) -> Float[np.ndarray, "n 6"]:
+    """Labels of all frames where nothing is withheld, whatever the sigma of their lines."""
     # Without the sigma ahead, lines are given up to the steepest that any map labels.
-    bare = replace(drive_map, lines=lines, meta=drive_map.meta.model_copy(update={"ahead_sigma_cm": 0.0}))
-    return np.array([lines_at(bare, k, max_sigma_lanes).points_cm for k in range(len(bare.frames))])
+    meta = drive_map.meta.model_copy(update={"ahead_sigma_cm": 0.0})
+    bare = replace(drive_map.without_doubts(), meta=meta)
+    return np.array([lines_at(bare, k, np.inf).points_cm for k in range(len(bare.frames))])
 
 
 def label_table(mapped: MappedDrive, map_folder: Path, drive_path: Path) -> dict[str, Any]:

@@ -24,12 +24,19 @@ from datagen.world.car.car import Car
 from datagen.world.car.driver import Driver
 from datagen.world.render.renderer import Renderer
 from datagen.world.road.track import write_track
-from datagen.world.simulate import DriveState, draw_state, recorded_command, scripted_states, simulate_drive
+from datagen.world.simulate import (
+    FILE_JPEG_QUALITY,
+    DriveState,
+    draw_state,
+    recorded_command,
+    scripted_states,
+    simulate_drive,
+    true_columns,
+)
 from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import dump_settings
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.files import write_text
-from lanenet.geometry.lane import POINT_NAMES
 
 TRAPS = ("corners", "straights", "eight", "pulses", "pauses", "kinks", "widening", "dark", "wide", "mixed")
 SPEED_CM_S, RATE_HZ, LAPS = 70.0, 20.0, 2.1
@@ -44,8 +51,6 @@ RINGS = {
 TILE_CM, TILE_LANE_CM = (55.0, 65.0), 23.0
 TILE_LANES_CM, LENSES_DEG = (23.0, 26.5, 32.0), (110.0, 120.0, 130.0, 140.0, 150.0)
 
-#: Of images in files, where the camera does not compress.
-FILE_QUALITY = 92
 #: Look of a floor on which nothing but the lines tells one place from another.
 BARE = dict.fromkeys(
     ("clutter_per_m", "objects_per_m", "prints_per_m", "glints_per_m", "specks_per_m", "shadows_per_m"), 0.0
@@ -109,13 +114,11 @@ def write_legs(settings: SimulationSettings, legs: Sequence[Leg], out: Path) -> 
     renderer: Renderer = ways[0].renderer  # one for both ways, so that all lies where it lay
     notes = f"simulated, seed {settings.seed}, {len(legs)} legs"
     width_cm, camera = settings.track.lane_width_cm, ways[0].camera
-    quality = ways[0].settings.look.jpeg_quality or FILE_QUALITY
+    quality = ways[0].settings.look.jpeg_quality or FILE_JPEG_QUALITY
     with DriveWriter(out, camera, width_cm, notes, quality, camera_method="simulation") as writer:
         for world, state in leg_states(ways, legs):
-            pose = dict(zip(("x_cm", "y_cm", "heading_rad"), map(float, state.pose), strict=True))
-            points = dict(zip(POINT_NAMES, map(float, state.points_cm), strict=True))
             command = recorded_command(world, state)
-            writer.add(draw_state(renderer, state), state.t_s, truth={**pose, **points}, **command)
+            writer.add(draw_state(renderer, state), state.t_s, truth=true_columns(state), **command)
         write_track(writer.folder / "track.json", ways[0].track)
         write_text(writer.folder / "simulation.yaml", dump_settings(ways[0].settings))
 
@@ -203,6 +206,28 @@ def road(trap: str, rng: np.random.Generator) -> dict[str, Any]:
     return made
 
 
+def usual_camera(rng: np.random.Generator) -> dict[str, Any]:
+    """A camera as those of a Donkeycar."""
+    return {
+        "width": 160, "height": 120,
+        "field_of_view_rad": math.radians(float(rng.uniform(110.0, 150.0))),
+        "height_cm": float(rng.uniform(14.0, 22.0)),
+        "pitch_down_rad": math.radians(float(rng.uniform(13.0, 25.0))),
+        "roll_rad": float(rng.normal(0.0, 0.012)), "yaw_rad": float(rng.normal(0.0, 0.02)),
+        "distortion": (float(rng.uniform(-0.05, 0.01)), 0.0, 0.0, 0.0),
+    }  # fmt: skip
+
+
+def usual_car(rng: np.random.Generator) -> dict[str, Any]:
+    """A car that does not quite steer as it is told."""
+    return {
+        "wheelbase_cm": float(rng.uniform(16.0, 22.0)),
+        "steering_gain": float(rng.uniform(0.85, 1.1)),
+        "steering_trim_rad": float(rng.uniform(-0.03, 0.03)),
+        "max_steering_rad": 0.6,
+    }
+
+
 def drive_settings(number: int, seed: int) -> tuple[SimulationSettings, str, bool]:
     """Settings of one drive, its trap, and whether the camera is known."""
     rng = np.random.default_rng(seed + number)
@@ -217,22 +242,9 @@ def drive_settings(number: int, seed: int) -> tuple[SimulationSettings, str, boo
     settings = {
         "seed": seed + number,
         "rate_hz": RATE_HZ,
-        "camera": {
-            "width": 160, "height": 120,
-            "field_of_view_rad": math.radians(float(rng.uniform(110.0, 150.0))),
-            "height_cm": float(rng.uniform(14.0, 22.0)),
-            "pitch_down_rad": math.radians(float(rng.uniform(13.0, 25.0))),
-            "roll_rad": float(rng.normal(0.0, 0.012)), "yaw_rad": float(rng.normal(0.0, 0.02)),
-            "distortion": (float(rng.uniform(-0.05, 0.01)), 0.0, 0.0, 0.0),
-        },
+        "camera": usual_camera(rng),
         "track": track,
-        "car": {
-            "wheelbase_cm": float(rng.uniform(16.0, 22.0)),
-            "steering_gain": float(rng.uniform(0.85, 1.1)),
-            "steering_trim_rad": float(rng.uniform(-0.03, 0.03)),
-            "max_steering_rad": 0.6,
-            "speed_gain": gain,
-        },
+        "car": usual_car(rng) | {"speed_gain": gain},
         "driver": {
             "speed_cm_s": speed_cm_s,
             "speed_variation": float(rng.uniform(0.0, 0.2)),
@@ -362,22 +374,9 @@ def car_like_people(rng: np.random.Generator, track: dict[str, Any]) -> dict[str
     return {
         "seed": int(rng.integers(2**31)),
         "rate_hz": RATE_HZ,
-        "camera": {
-            "width": 160, "height": 120,
-            "field_of_view_rad": math.radians(float(rng.uniform(110.0, 150.0))),
-            "height_cm": float(rng.uniform(14.0, 22.0)),
-            "pitch_down_rad": math.radians(float(rng.uniform(13.0, 25.0))),
-            "roll_rad": float(rng.normal(0.0, 0.012)), "yaw_rad": float(rng.normal(0.0, 0.02)),
-            "distortion": (float(rng.uniform(-0.05, 0.01)), 0.0, 0.0, 0.0),
-        },
+        "camera": usual_camera(rng),
         "track": track,
-        "car": {
-            "wheelbase_cm": float(rng.uniform(16.0, 22.0)),
-            "steering_gain": float(rng.uniform(0.85, 1.1)),
-            "steering_trim_rad": float(rng.uniform(-0.03, 0.03)),
-            "max_steering_rad": 0.6,
-            "speed_gain": float(rng.uniform(0.85, 1.1)),
-        },
+        "car": usual_car(rng) | {"speed_gain": float(rng.uniform(0.85, 1.1))},
         "driver": {
             "speed_cm_s": SPEED_CM_S * float(rng.uniform(0.8, 1.2)),
             "speed_variation": float(rng.uniform(0.0, 0.2)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -167,6 +167,14 @@ class DriveMap:
         m = self.camera.mounting
         pitch, roll = (float(angle) for angle in self.tilt_rad[k])
         return self.camera.with_mounting(pitch_down_rad=m.pitch_down_rad + pitch, roll_rad=m.roll_rad + roll)
+
+    def without_doubts(self) -> DriveMap:
+        """Return the map as it was before it was judged: nothing of it is withheld."""
+        lines = {
+            segment: [replace(line, contradicted_cm=np.empty((0, 2))) for line in found]
+            for segment, found in self.lines.items()
+        }
+        return replace(self, lines=lines, errors=LabelErrors.none(len(self.frames)))
 
     @cached_property
     def lanes(self) -> FrameLanes:

@@ -198,12 +198,6 @@ def steepest_label(drive_map: DriveMap) -> float:
     return min(STEEPEST, most_cm / max(drive_map.meta.ahead_sigma_cm, 1e-9))
 
 
-def known_lines(drive_map: DriveMap) -> Bool[np.ndarray, "n 2"]:
-    """Find which frames have their left, their right line at one label row at least."""
-    points = [lines_at(drive_map, k).points_cm for k in range(len(drive_map.frames))]
-    return np.asarray(np.isfinite(points).reshape(-1, 2, N_POINTS // 2).any(axis=2))
-
-
 def label_frame(
     mapped: MappedDrive, k: int, window: BirdseyeWindow
 ) -> tuple[FrameLines, Float[np.ndarray, "6"]] | str:

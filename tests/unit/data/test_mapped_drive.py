@@ -24,7 +24,7 @@ from lanenet.data.drives import Drive
 from lanenet.data.drives.content import image_marks
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.label_set import read_labels, write_labels
-from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, read_map, write_map
+from lanenet.data.maps.folder import FORMAT, SETTINGS_NAME, DriveMap, MapMeta, write_map
 from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.line import LaneLine, Side
 from lanenet.data.maps.mapped_drive import (
@@ -35,7 +35,6 @@ from lanenet.data.maps.mapped_drive import (
     NO_LINE,
     NOT_TO_LABEL,
     OUTSIDE,
-    known_lines,
     label_frame,
     label_frames,
     labelled_points,
@@ -372,17 +371,6 @@ def test_nothing_is_left_where_the_line_is_doubted_and_the_other_lies_beside_the
     doubting = replace(mapped, drive_map=replace(mapped.drive_map, errors=doubted(6, slice(3))))
     assert not isinstance(label_frame(mapped, 6, far), str)
     assert label_frame(doubting, 6, far) == DOUBTFUL
-
-
-def test_a_frame_lacks_a_line_that_ends_before_its_first_label_row(folder):
-    drive_map = read_map(folder)
-    assert known_lines(drive_map).all()
-    # The right line ends at 60 cm, and the front axle is 20 cm ahead of the pose.
-    further = 2.0 * MAPPED
-    later = replace(drive_map, poses=np.column_stack([further, *np.zeros((2, len(MAPPED)))]), s_cm=further)
-    found = known_lines(later)
-    assert found[:, 0].all()
-    np.testing.assert_array_equal(found[:, 1], further + CAMERA.wheelbase_cm < 60.0)
 
 
 def test_points_that_the_map_lacks_are_missed_and_those_beside_the_window_are_not(folder):
