@@ -168,7 +168,9 @@ def measure_map(mapped: MappedDrive) -> MapQuality:
     samples, chance = [], []
     tape_cm, lane_cm = drive_map.meta.tape_cm, drive_map.meta.mapped_lane_cm
     for k, edges, keep in frame_edges(mapped, rows):
-        lines, nodded = lines_at(drive_map, k), drive_map.camera_at(k)
+        # What is withheld is no part of the map's answer.
+        lines = lines_at(drive_map, k).without(drive_map.errors.doubted[k])
+        nodded = drive_map.camera_at(k)
         samples.append(border_samples(edges, lines, tape_cm, nodded, keep))
         left = lines.without(np.repeat([False, True], len(ROWS_CM)))
         chance.append(border_samples(edges, left, tape_cm, nodded, keep, aside_cm=0.5 * lane_cm))
