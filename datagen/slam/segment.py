@@ -28,9 +28,23 @@ from datagen.slam.loops.consistency import (
     with_supported,
     without_contradicted,
 )
-from datagen.slam.loops.parts import LEAST_TIED, connected, placing_revisits, tied_frames, whole_turns
+from datagen.slam.loops.parts import (
+    LEAST_TIED,
+    carried,
+    connected,
+    placing_revisits,
+    tied_frames,
+    whole_turns,
+)
 from datagen.slam.loops.pose_graph import close_loops, inlier_revisits, loop_pairs, neighbouring_laps
-from datagen.slam.loops.revisits import PlaceMatcher, Revisit, propose_beside, propose_revisits, thumbnails
+from datagen.slam.loops.revisits import (
+    PlaceMatcher,
+    Revisit,
+    propose_beside,
+    propose_revisits,
+    propose_turned,
+    thumbnails,
+)
 from datagen.slam.odometry.scans import Scans
 from datagen.slam.settings import SlamSettings
 from datagen.slam.track import track
@@ -420,7 +434,10 @@ class _DenseSegment:
         """Propose pairs of frames that look alike, and align each with the map around the earlier one."""
         s, periods = self.revisit_settings, self.view.commands.periods
         pairs = propose_revisits(thumbnails(self.view.drive), opened.poses, periods, self.height, s)
-        return self.place_matcher(opened).matched(pairs, self.solver.rng)
+        matcher, rng = self.place_matcher(opened), self.solver.rng
+        turned = propose_turned(opened.poses, self.part, self.height, s)
+        facing = [matcher.match((earlier, later), rng, at) for earlier, later, at in turned]
+        return matcher.matched(pairs, rng) + [r for r in facing if r is not None]
 
     def place_matcher(self, opened: BundleResult) -> PlaceMatcher:
         """Aligns visits of a place by the edges that the open loop maps around each."""
@@ -504,9 +521,9 @@ class _DenseSegment:
             yield [
                 few if len(few) >= s.min_revisits else group for few, group in zip(left, groups, strict=True)
             ]
-        placing = placing_revisits(poses, self.part, matched, self.height)
-        if len(placing) >= s.min_revisits:
-            yield [placing]
+        alike = [r for r in matched if abs(r.relative[2]) < 0.5 * np.pi]
+        placing = [placing_revisits(poses, self.part, some, self.height) for some in (matched, alike)]
+        yield [one for one in placing if len(one) >= s.min_revisits]
         # A wrong camera bends the open loop: then true revisits explain each other better than it does.
         if len(matched) >= s.min_revisits:
             yield [[replace(r, turns=whole_turns(poses, r)) for r in matched]]
@@ -519,14 +536,18 @@ class _DenseSegment:
         """Negative log likelihood of a closure's revisits, and of the heading that odometry misses in a lap.
 
         A lap with five corners instead of four may look alike in all frames; the odometry knows better. It
-        knows less where a gap was bridged, and where the camera is still to be found.
+        knows less where a gap was bridged, and where the camera is still to be found. And a car that was
+        turned round or lifted goes on near where it was.
         """
+        group, breaks = connected(self.part, closure.revisits), np.flatnonzero(np.diff(self.part))
+        breaks = breaks[group[breaks] == group[breaks + 1]]
+        moved = carried(closure.bundle.poses, breaks, self.height)
         within = [r for r in closure.revisits if self.part[r.earlier] == self.part[r.later]]
         missed = heading_drift(opened.poses, within)[1] if within else 0.0
         gaps = self.view.commands.periods[self.view.commands.periods <= MOST_BRIDGED]
         laps = max(float(np.ptp(opened.poses[:, 2])) / (2.0 * np.pi), 1.0)
         variance = _DRIFT_RAD[self.find_camera] ** 2 + np.sum(gaps > 1.0) / laps * _GAP_RAD**2
-        return float(0.5 * missed**2 / variance) - _EXPLAINED * len(closure.revisits)
+        return float(0.5 * missed**2 / variance) + moved - _EXPLAINED * len(closure.revisits)
 
     def likeliest(self, rivals: Sequence[_Closure], opened: BundleResult) -> _Closure | None:
         """Choose among closures that go around by other ways; None if there are none.

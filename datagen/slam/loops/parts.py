@@ -24,6 +24,12 @@ from lanenet.geometry.poses import compose, moved_rigidly, path_lengths, relativ
 #: Separate places at which revisits must agree to place one part on another. Chosen: one place may look like
 #: another one by chance; that a second one at the right distance from it does, too, is rare.
 _LEAST_PLACES = 2
+#: Placements of one part on another that are compared. Chosen: those on both corridors of an office, each in
+#: both directions.
+_MOST_RIVALS = 4
+#: Scale of the way that a car is carried or rolls over a break of the recording, in camera heights. Chosen:
+#: two or three lengths of a car.
+_CARRIED_HEIGHTS = 3.0
 #: Frames of a part that show the road, without which its poses are not determined. Chosen: the motion model
 #: holds only changes of speed and of turn, which takes three frames; speed and turn themselves are left to
 #: the images, and a fourth frame checks them.
@@ -38,6 +44,10 @@ def placing_revisits(
 ) -> list[Revisit]:
     """Choose the revisits that place parts on each other, as many as agree, and no part twice.
 
+    Places that look alike place a part here or there, as on one of two parallel corridors. Most often a car
+    goes on near where it was stopped, turned round or put down: of rival sets of revisits that one counts
+    which is the largest, less what :func:`carried` costs.
+
     Args:
         poses: Poses, each part in shape, in any place.
         part: Part of the drive that each frame belongs to.
@@ -45,29 +55,60 @@ def placing_revisits(
         camera_height_cm: Sets the scale.
 
     Returns:
-        For each pair of parts that are joined the largest set of revisits that agree, with their whole turns;
-        the largest sets first. Sets that would join parts twice are left out: other evidence decides on them.
+        For parts that are joined a set of revisits that agree, with their whole turns; the likeliest sets
+        first. Sets that would join parts twice are left out: other evidence decides on them.
     """
     between: dict[tuple[int, int], list[Revisit]] = {}
     for r in revisits:
         if part[r.earlier] != part[r.later]:
             pair = sorted((int(part[r.earlier]), int(part[r.later])))
             between.setdefault((pair[0], pair[1]), []).append(r)
-    path = path_lengths(poses)
+    path, group, placed = path_lengths(poses), part.copy(), poses.copy()
     sets = []
     for (_, moved), found in between.items():
-        agreeing = _largest_agreeing(poses, part, moved, found, camera_height_cm)
-        at = [r.later if part[r.later] == moved else r.earlier for r in agreeing]
-        if count_places(path[at], camera_height_cm) >= _LEAST_PLACES:
+        for _ in range(_MOST_RIVALS):
+            agreeing = _largest_agreeing(poses, part, moved, found, camera_height_cm)
+            at = [r.later if part[r.later] == moved else r.earlier for r in agreeing]
+            if count_places(path[at], camera_height_cm) < _LEAST_PLACES:
+                break
             sets.append(agreeing)
+            found = [r for r in found if all(r is not one for one in agreeing)]
+
+    def joined(agreeing: list[Revisit]) -> tuple[float, Float[np.ndarray, "n 3"]]:
+        """How likely a set is, and the poses with the group of the later visits moved as it says."""
+        r, trial = agreeing[0], placed.copy()
+        a, b = group[r.earlier], group[r.later]
+        mine = group == b
+        trial[mine] = moved_rigidly(placed[mine], placed[r.later], compose(placed[r.earlier], r.relative))
+        ends = np.sort(np.stack([group[:-1], group[1:]]), axis=0)
+        breaks = np.flatnonzero((ends[0] == min(a, b)) & (ends[1] == max(a, b)))
+        return len(agreeing) - carried(trial, breaks, camera_height_cm), trial
+
     chosen: list[Revisit] = []
-    group = {int(number): int(number) for number in np.unique(part)}
-    for agreeing in sorted(sets, key=len, reverse=True):
-        a, b = (group[int(part[k])] for k in (agreeing[0].earlier, agreeing[0].later))
-        if a != b:
-            chosen += agreeing
-            group = {number: a if own == b else own for number, own in group.items()}
+    while sets:
+        likeliest = max(sets, key=lambda one: joined(one)[0])
+        likelihood, trial = joined(likeliest)
+        if likelihood < 0.0:
+            break
+        placed, chosen = trial, chosen + likeliest
+        group[group == group[likeliest[0].later]] = group[likeliest[0].earlier]
+        sets = [one for one in sets if group[one[0].earlier] != group[one[0].later]]
     return [replace(r, turns=whole_turns(poses, r)) for r in chosen]
+
+
+def carried(poses: Float[np.ndarray, "n 3"], breaks: Int[np.ndarray, "b"], camera_height_cm: float) -> float:
+    """Negative log likelihood of the ways from the last frame before a break to the first one behind it.
+
+    Args:
+        poses: Poses on one map.
+        breaks: Last frames before breaks of the recording.
+        camera_height_cm: Sets the scale.
+    """
+    off = np.diff(poses[np.stack([breaks, breaks + 1]), :2], axis=0)[0] / (
+        _CARRIED_HEIGHTS * camera_height_cm
+    )
+    # Of a Cauchy distribution in the plane.
+    return 1.5 * float(np.log1p(np.sum(off**2, axis=1)).sum())
 
 
 def whole_turns(poses: Float[np.ndarray, "n 3"], revisit: Revisit) -> int:
@@ -112,7 +153,7 @@ def _largest_agreeing(
     revisits: list[Revisit],
     height_cm: float,
 ) -> list[Revisit]:
-    """Find the largest set of revisits between two parts that agree with one of them.
+    """Find the largest set of revisits between two parts that agree with one of them, which comes first.
 
     Args:
         poses: Poses.
@@ -129,11 +170,11 @@ def _largest_agreeing(
         target.append(compose(poses[r.earlier], r.relative) if later else compose(poses[r.later], back))
     own, to = poses[inside], np.array(target)
     best = np.zeros(0, np.intp)
-    for one, place in zip(own, to, strict=True):
+    for k, (one, place) in enumerate(zip(own, to, strict=True)):
         off = moved_rigidly(own, one, place) - to
         apart = np.hypot(*(own - one)[:, :2].T)
         near = np.hypot(off[:, 0], off[:, 1]) < AGREE_HEIGHTS * height_cm + AGREE_SHARE * apart
         agreeing = np.flatnonzero(near & (np.abs(wrap_angle(off[:, 2])) < AGREE_RAD))
         if len(agreeing) > len(best):
-            best = agreeing
+            best = np.concatenate([[k], agreeing[agreeing != k]])
     return [revisits[k] for k in best]

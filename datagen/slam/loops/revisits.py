@@ -50,6 +50,15 @@ _BLOCK = 256
 #: Frames to either side that make the map of the earlier visit and the edges of the later one: the first must
 #: reach as far as the second may be off. Edge points per frame of the latter, and the fewest of them all.
 _MAP_FRAMES, _QUERY_FRAMES, _QUERY_POINTS, _LEAST_POINTS = 20, 4, 60, 20
+#: Of frames that see the same road from both sides: their distance, the largest offset along the road, and
+#: the path behind the turn on which they are sought, in camera heights; frames to either side that make the
+#: map of the earlier one. Chosen: where each sees best; as far as a car is carried when it is turned round; a
+#: corridor and the corner behind it; what the offset reaches.
+_FACING_HEIGHTS, _CARRIED_HEIGHTS, _TURNED_HEIGHTS, _TURNED_FRAMES = 6.0, 8.0, 60.0, 60
+#: Share of the best match that frames facing each other may have elsewhere along the road: a straight, or
+#: dashes, look alike all along. Measured on two office drives: 0.30 to 0.89 where they were right, 0.93 to
+#: 1.0 where they were off by some dashes.
+_AS_WELL = 0.9
 #: The search: cells of the field in camera heights, coarse to fine; the grid's spacing in camera heights and
 #: degrees; the sigma of the samples about its best heading, degrees, by how much it shrinks, and their
 #: number. Chosen: the spacing is about a cell of the coarsest field.
@@ -270,6 +279,42 @@ def propose_beside(
     return sorted(set(pairs))
 
 
+def propose_turned(
+    poses: Float[np.ndarray, "n 3"],
+    part: Int[np.ndarray, "n"],
+    camera_height_cm: float,
+    settings: RevisitSettings,
+) -> list[tuple[int, int, Float[np.ndarray, "3"]]]:
+    """Propose pairs (earlier, later) of frames that face each other, were the car turned round at a break.
+
+    Their images have nothing in common, but the road between them is the same, seen from both sides.
+
+    Args:
+        poses: Open-loop trajectory.
+        part: Part of the drive that each frame belongs to.
+        camera_height_cm: Sets the scale.
+        settings: Bounds; parts that are shorter than ``min_gap_heights`` are left out.
+
+    Returns:
+        The pairs, each with the pose of the later frame in the rear-axle frame of the earlier if the car was
+        turned on the spot.
+    """
+    path, proposed = path_lengths(poses), []
+    facing_cm, spacing_cm = (h * camera_height_cm for h in (_FACING_HEIGHTS, settings.pair_heights))
+    for last in np.flatnonzero(np.diff(part)).tolist():
+        first, stop = np.searchsorted(part, part[last]), np.searchsorted(part, part[last + 1], "right")
+        shorter_cm = min(path[last] - path[first], path[stop - 1] - path[last + 1])
+        if shorter_cm < settings.min_gap_heights * camera_height_cm:
+            continue
+        most_cm = min(shorter_cm - facing_cm, _TURNED_HEIGHTS * camera_height_cm)
+        for gone_cm in np.arange(spacing_cm, most_cm, spacing_cm):
+            later = int(np.searchsorted(path, path[last + 1] + gone_cm))
+            earlier, mirrored = np.searchsorted(path, path[last] - gone_cm - np.array([facing_cm, 0.0]))
+            turned = poses[mirrored] + [0.0, 0.0, np.pi]
+            proposed.append((int(earlier), later, relative_pose(poses[earlier], turned)))
+    return proposed
+
+
 def similarities(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:
     """Correlation of all thumbnails with all others, at the sideways shift at which it is highest."""
     images = b.reshape(len(b), SMALL_HEIGHT, SMALL_WIDTH)
@@ -314,8 +359,18 @@ class PlaceMatcher:
         found = (self.match(pair, rng) for pair in pairs)
         return [revisit for revisit in found if revisit is not None]
 
-    def match(self, pair: tuple[int, int], rng: np.random.Generator) -> Revisit | None:
+    def match(
+        self,
+        pair: tuple[int, int],
+        rng: np.random.Generator,
+        turned: Float[np.ndarray, "3"] | None = None,
+    ) -> Revisit | None:
         """Align two visits: a search over a grid on a coarse field, then two rounds of samples on finer ones.
+
+        Args:
+            pair: The earlier and the later frame.
+            rng: Draws edge points and samples.
+            turned: Where the later frame is sought if they face each other, see :func:`propose_turned`.
 
         Returns:
             The revisit, or None where too few edges match.
@@ -325,12 +380,14 @@ class PlaceMatcher:
         query = self._submap(self._around(later, _QUERY_FRAMES), later, rng)
         if len(query.weights) < _LEAST_POINTS:
             return None
-        near = self._around(earlier, _MAP_FRAMES)
+        about = np.zeros(3) if turned is None else turned
+        near = self._around(earlier, _MAP_FRAMES if turned is None else _TURNED_FRAMES)
         step = _GRID_HEIGHTS * height_cm
-        reach = np.array([s.along_heights, s.sideways_heights]) * height_cm
+        along_heights = s.along_heights if turned is None else _CARRIED_HEIGHTS
+        reach = np.array([along_heights, s.sideways_heights]) * height_cm
         along, sideways = (np.arange(-r, r + 1e-9, step) for r in reach)
         angles = np.arange(-s.search_rad, s.search_rad + 1e-9, np.deg2rad(_GRID_DEG))
-        tried = np.stack(np.meshgrid(along, sideways, angles, indexing="ij"), axis=-1).reshape(-1, 3)
+        tried = about + np.stack(np.meshgrid(along, sideways, angles, indexing="ij"), axis=-1).reshape(-1, 3)
         spread = np.array([step, step, np.deg2rad(_SAMPLE_DEG)])
         best, share = np.zeros(3), 0.0
         for cell_heights in _CELLS_HEIGHTS:
@@ -343,10 +400,13 @@ class PlaceMatcher:
                     scan.weights / len(near),
                 )
             field.vectors[...] *= _FIELD_GAIN
-            prior = _PLACE_PRIOR * np.sum((tried[:, :2] / reach) ** 2, axis=1)
+            prior = _PLACE_PRIOR * np.sum(((tried - about)[:, :2] / reach) ** 2, axis=1)
             if len(tried) > _SAMPLES:
                 few = Scan(*(column[::_EVERY_POINT] for column in query))
                 rough = self._shares(field, tried, few) - prior
+                off_cm = np.abs(tried[:, 0] - tried[int(rough.argmax()), 0])
+                if turned is not None and rough[off_cm > height_cm].max() > _AS_WELL * rough.max():
+                    return None
                 kept = np.argpartition(-rough, _BEST_POSES)[:_BEST_POSES]
                 tried, prior = tried[kept], prior[kept]
             scores = self._shares(field, tried, query)

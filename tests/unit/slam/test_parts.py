@@ -138,6 +138,17 @@ def test_revisits_of_one_place_alone_place_nothing():
     assert placing_revisits(poses, part, [replace(right[0], later=30 + k) for k in range(4)], 15.0) == []
 
 
+def test_of_two_corridors_that_look_alike_it_is_the_one_where_the_car_was():
+    poses, part, right = _two_parts()
+    # The other corridor is 8 m away, and one more place of it matches.
+    more = [*right, replace(right[0], earlier=1, later=31, relative=relative_pose(poses[1], poses[1]))]
+    far = [replace(r, relative=r.relative + [0.0, 800.0, 0.0]) for r in more]
+    placed = placing_revisits(poses, part, [*far, *right], 15.0)
+    assert {(r.earlier, *r.relative) for r in placed} == {(r.earlier, *r.relative) for r in right}
+    # Fewer places than such a way is unlikely say nothing.
+    assert placing_revisits(poses, part, far[:4], 15.0) == []
+
+
 def test_a_part_is_placed_once_by_the_larger_set():
     poses, _, right = _two_parts()
     part = np.repeat([0, 1, 2], [15, 15, 30])

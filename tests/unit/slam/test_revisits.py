@@ -17,13 +17,14 @@ from datagen.slam.loops.revisits import (
     diagonal_mean,
     propose_beside,
     propose_revisits,
+    propose_turned,
     similarities,
     thumbnails,
 )
 from datagen.slam.odometry.scans import Scan, Scans, pack_scans
 from datagen.slam.settings import GuessSettings
 from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
-from lanenet.geometry.poses import compose, path_lengths
+from lanenet.geometry.poses import compose, path_lengths, relative_pose
 from lanenet.perception.edges.road import RoadEdges
 
 LAP = 100
@@ -33,12 +34,16 @@ def _one_part(frames: np.ndarray) -> np.ndarray:
     return np.zeros(len(frames), np.int64)
 
 
+def _matcher(scans: Scans, poses: np.ndarray, part: np.ndarray) -> PlaceMatcher:
+    camera = guessed_camera(160, 120, 80.0, 0.2, GuessSettings(wheelbase_cm=WHEELBASE_CM))
+    camera = camera.with_mounting(height_cm=HEIGHT_CM)
+    return PlaceMatcher(scans, poses, part, camera, RevisitSettings())
+
+
 def _match(
     scans: Scans, poses: np.ndarray, pair: tuple[int, int], rng: np.random.Generator
 ) -> Revisit | None:
-    camera = guessed_camera(160, 120, 80.0, 0.2, GuessSettings(wheelbase_cm=WHEELBASE_CM))
-    camera = camera.with_mounting(height_cm=HEIGHT_CM)
-    return PlaceMatcher(scans, poses, _one_part(poses), camera, RevisitSettings()).match(pair, rng)
+    return _matcher(scans, poses, _one_part(poses)).match(pair, rng)
 
 
 def _pictures(rng: np.random.Generator, frames: int, shift: int = 0) -> np.ndarray:
@@ -226,6 +231,41 @@ def test_matching_recovers_the_relative_pose(seed, relative):
     assert np.abs(found.relative[:2] - relative[:2]).max() < 0.1 * HEIGHT_CM
     assert abs(found.relative[2] - relative[2]) < np.deg2rad(2.0)
     assert 0.35 <= found.match <= 1.0
+
+
+def _there_and_back(road: TapeRoad, carried: int) -> tuple[Scans, np.ndarray, np.ndarray, np.ndarray]:
+    """A road driven to its end, then back from so many frames before it: true poses, and two parts."""
+    back = road.poses[-1 - carried :: -1] + [0.0, 0.0, np.pi]
+    true = np.concatenate([road.poses, back])
+    apart = np.concatenate([road.poses, compose(np.array([80.0, 30.0, 0.4]), back)])
+    return road.scans(true), true, apart, np.repeat([0, 1], [len(road.poses), len(back)])
+
+
+@pytest.mark.parametrize("carried", [0, 20])
+def test_a_car_that_was_turned_round_finds_its_way_back(carried):
+    scans, true, apart, part = _there_and_back(tape_road(220), carried)
+    matcher, rng = _matcher(scans, apart, part), np.random.default_rng(0)
+    proposed = propose_turned(apart, part, HEIGHT_CM, RevisitSettings())
+    found = [matcher.match((earlier, later), rng, at) for earlier, later, at in proposed]
+    known = [r for r in found if r is not None]
+    assert len(proposed) >= 8
+    assert len(known) >= 4
+    for r in known:
+        off = r.relative - relative_pose(true[r.earlier], true[r.later])
+        assert np.abs(off[:2]).max() < 0.1 * HEIGHT_CM
+        assert abs(wrap_angle(off[2:])[0]) < np.deg2rad(2.0)
+
+
+def test_a_turn_on_a_straight_or_of_a_short_part_finds_nothing():
+    scans, _, apart, part = _there_and_back(tape_road(220, 0.0, 0.0), 0)
+    matcher, rng = _matcher(scans, apart, part), np.random.default_rng(0)
+    assert propose_turned(apart[:260], part[:260], HEIGHT_CM, RevisitSettings()) == []
+    # Without the ends of its dashes the tape is alike all along.
+    scans.weights[np.abs(scans.normals[:, 1]) > 0.5] = 0.0
+    assert all(
+        matcher.match((earlier, later), rng, at) is None
+        for earlier, later, at in propose_turned(apart, part, HEIGHT_CM, RevisitSettings())
+    )
 
 
 def test_places_that_differ_do_not_match():
