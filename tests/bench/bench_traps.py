@@ -44,10 +44,10 @@ MAX_RMSE_CM, MAX_STRETCH_CM, STRETCH_CM = 1.0, 3.0, 30.0
 #: A label further than this from any paint is beside it.
 BESIDE_PAINT_CM = 1.0
 COLUMNS = (
-    "drive", "trap", "camera", "told", "verdict", "frames", "mapped", "labelled", "rmse_cm", "worst_cm",
-    "worst_at_cm", "bias_cm", "beside_paint", "revisits", "segments", "closed", "pose_worst_cm",
-    "pose_worst_lanes", "focal_error", "focal_sigma", "pitch_error_deg", "pitch_sigma_deg", "height_error",
-    "height_sigma", "cpu_s", "reason",
+    "drive", "trap", "camera", "told", "verdict", "state", "frames", "mapped", "labelled", "labels", "off_3",
+    "rmse_cm", "worst_cm", "worst_at_cm", "bias_cm", "beside_paint", "revisits", "segments", "closed",
+    "pose_worst_cm", "pose_worst_lanes", "focal_error", "focal_sigma", "pitch_error_deg", "pitch_sigma_deg",
+    "height_error", "height_sigma", "cpu_s", "reason",
 )  # fmt: skip
 
 
@@ -63,7 +63,9 @@ def label_errors(folder: Path, drive: Path, wheelbase_cm: float) -> dict[str, An
     index = read_map(folder).frames
     true_points = np.stack([truth[point] for point in POINT_NAMES], axis=1)
     true_points = np.array([BirdseyeWindow().labelled(points) for points in true_points])
-    true_points[true_lines(drive, truth, wheelbase_cm)[1]] = np.nan
+    # Beyond a line of a road of one lane, map and truth may count another lane, and both are right.
+    beyond = (true_points[:, 0] > 0.0) | (true_points[:, len(ROWS_CM)] < 0.0)
+    true_points[true_lines(drive, truth, wheelbase_cm)[1] | beyond] = np.nan
     miss_cm = np.full_like(true_points, np.nan)
     miss_cm[index] = read_map_frames(folder).points_cm - true_points[index]
     xy = np.stack([truth["x_cm"], truth["y_cm"]], axis=1)
@@ -81,6 +83,8 @@ def label_errors(folder: Path, drive: Path, wheelbase_cm: float) -> dict[str, An
     return {
         "mapped": len(index),
         "labelled": round(float(known.sum() / max(np.isfinite(true_points).sum(), 1)), 3),
+        "off_3": int((np.abs(miss_cm[known]) > 3.0).sum()),
+        "labels": int(known.sum()),
         "rmse_cm": round(float(np.sqrt(np.mean(miss_cm[known] ** 2))), 3) if known.any() else None,
         "worst_cm": round(worst_cm, 2),
         "worst_at_cm": round(worst_at_cm),
@@ -190,7 +194,7 @@ def judge(kind: str, number: int, folder: Path, seed: int) -> dict[str, Any]:
             "reason": str(error),
         }
     row["cpu_s"] = round(time.process_time() - start, 1)
-    row["verdict"] = report.figures["verdict"]["grade"]
+    row |= {"verdict": report.figures["verdict"]["grade"], "state": report.figures["verdict"]["state"]}
     row["reason"] = "; ".join(report.figures["verdict"]["reasons"])
     true_camera = made.settings.camera.build(wheelbase_cm)
     row |= label_errors(out, drive, wheelbase_cm)

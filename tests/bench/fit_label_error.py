@@ -1,5 +1,7 @@
 """Fit the model of label errors to tables of ``label_tables.py``: ``make fit-labels``.
 
+With ``--check`` nothing is fitted: the errors that the tables' maps foretell are compared with the true ones.
+
 Drives are left out in turn (five folds by drive), for the calibration and for the figures that are printed:
 log loss, expected and observed shares by bins of the predicted probability with intervals by bootstrap over
 drives, and what is kept and wrong for bounds of the probability. The model that is stored is fitted to all.
@@ -54,7 +56,7 @@ def read(folders: list[Path]) -> dict[str, np.ndarray]:
         with np.load(path) as table:
             count = len(table["error_cm"])
             parts.setdefault("spoilt", []).append(np.full(count, bool(table["spoilt"])))
-            for name in ("features", "error_cm", "withheld", "row"):
+            for name in ("features", "error_cm", "withheld", "row", "off_1", "off_3"):
                 parts.setdefault(name, []).append(table[name])
             parts.setdefault("drive", []).append(np.full(count, group))
             for name in ("trap", "camera", "verdict"):
@@ -152,13 +154,37 @@ def kept_text(p1: np.ndarray, p3: np.ndarray, table: dict[str, np.ndarray]) -> s
     return "\n".join(lines)
 
 
+def kinds_text(p1: np.ndarray, p3: np.ndarray, table: dict[str, np.ndarray]) -> str:
+    """What some bounds keep, of all drives and by kind; spoilt copies do not count."""
+    own, said = ~table["spoilt"], []
+    for kind in ("all", *np.unique(table["trap"])):
+        rows = own & ((table["trap"] == kind) | (kind == "all"))
+        part = {name: values[rows] for name, values in table.items() if name != "names"}
+        said.append(f"{kind}:\n{kept_text(p1[rows], p3[rows], part)}\n")
+    return "".join(said)
+
+
+def check(table: dict[str, np.ndarray]) -> str:
+    """How often labels are off as often as their maps foretell."""
+    known = np.isfinite(table["off_3"]) & ~table["spoilt"]
+    said = f"{known.sum()} labels, {(~np.isfinite(table['off_3'])).sum()} not judged\n"
+    for name, bound_cm in zip(("off_1", "off_3"), BOUNDS_CM, strict=True):
+        wrong = np.abs(table["error_cm"][known]) > bound_cm
+        said += f"{name}:\n{bins_text(table[name][known], wrong, table['drive'][known])}\n"
+    return said + kinds_text(table["off_1"], table["off_3"], table)
+
+
 def main() -> None:
     """Fit, print, and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="+", help="of label_tables.py")
     parser.add_argument("--out", type=Path, help="file of the model; nothing is written without it")
+    parser.add_argument("--check", action="store_true", help="compare what maps foretell; fit nothing")
     args = parser.parse_args()
     table = read(args.folders)
+    if args.check:
+        sys.stdout.write(check(table))
+        return
     names, features, size = table["names"].tolist(), table["features"], np.abs(table["error_cm"])
     drives, columns, found = table["drive"], {"names": np.array(names)}, {}
     # Spoilt copies teach what is wrong, but say nothing of how often that is.
@@ -189,10 +215,7 @@ def main() -> None:
             )
         trees = stored(fit(target, features, size, names), scale)
         columns |= {f"{target}_{part}": value for part, value in trees._asdict().items()}
-    for kind in ("all", *np.unique(table["trap"])):
-        rows = own & ((table["trap"] == kind) | (kind == "all"))
-        part = {name: values[rows] for name, values in table.items() if name != "names"}
-        sys.stdout.write(f"{kind}:\n{kept_text(found['off_1'][rows], found['off_3'][rows], part)}\n")
+    sys.stdout.write(kinds_text(found["off_1"], found["off_3"], table))
     if args.out is not None:
         np.savez_compressed(args.out, allow_pickle=False, **columns)
         sys.stdout.write(f"{args.out}: {args.out.stat().st_size / 1000:.0f} kB\n")

@@ -49,8 +49,11 @@ def label_table(mapped: MappedDrive, map_folder: Path, drive_path: Path) -> dict
     rows = np.searchsorted(drive.frames, drive_map.frames)
     between = true_lines(drive_path, truth, drive.camera.wheelbase_cm)[1][rows]
     points_cm = window.labelled(projected(drive_map))
-    error_cm = points_cm - np.stack([truth[name] for name in POINT_NAMES], axis=1)[rows]
-    error_cm[between | drive_map.lanes.between | mapped.drive.deleted[mapped.rows]] = np.nan
+    true_cm = np.stack([truth[name] for name in POINT_NAMES], axis=1)[rows]
+    error_cm = points_cm - true_cm
+    # Beyond a line of a road of one lane, map and truth may count another lane, and both are right.
+    beyond = (true_cm[:, 0] > 0.0) | (true_cm[:, len(ROWS_CM)] < 0.0)
+    error_cm[between | beyond | drive_map.lanes.between | mapped.drive.deleted[mapped.rows]] = np.nan
     features = label_features(mapped, read_json(map_folder / "report.json", MapFormatError))
     frame, point = np.nonzero(np.isfinite(error_cm))
     at = frame, point
@@ -64,6 +67,8 @@ def label_table(mapped: MappedDrive, map_folder: Path, drive_path: Path) -> dict
         "side": point // len(ROWS_CM),
         "row": point % len(ROWS_CM),
         "withheld": ~np.isfinite(today[at]),
+        "off_1": drive_map.errors.off_1[at],
+        "off_3": drive_map.errors.off_3[at],
         "trap": np.array(trap),
         "drive": np.array(int(number)),
         "camera": np.array("found" if mapped.drive.path.name.endswith("_blind") else "known"),
