@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from datagen.quality.measure import held_out_frames
 from datagen.settings import MapSettings, with_wheelbase
 from datagen.slam.commands import habitual_pauses
+from datagen.slam.odometry.likely import MOST_POINTS
 from datagen.slam.odometry.stillness import following_frames, shrink_image
 from lanenet.data.camera_file import read_camera
 from lanenet.data.drives import Commands, Drive, open_drive
@@ -160,7 +161,7 @@ def prepare(request: MapRequest, settings: MapSettings) -> PreparedDrive:
                 f"{request.camera_path or drive.path}: the camera is known, {known.mounting.height_cm:g} cm "
                 f"high, but --camera-height gives {request.camera_height_cm:g} cm: expected one of them"
             )
-    notes += [*found, *deleted, *nominal, *hidden]
+    notes += [*found, *deleted, *nominal, *hidden, *_texture_notes(drive, settings.perception.edges)]
     pauses = habitual_pauses(opened)
     of_frames = tuple(marks[row] for row in drive.rows.tolist())
     return PreparedDrive(request, drive, held_out, settings, known, tuple(notes), pauses, of_frames)
@@ -360,17 +361,34 @@ def check_edges(drive: Drive, settings: EdgeSettings) -> None:
     Raises:
         TrackingLostError: Names the number of edge points.
     """
-    counts = []
-    for k in np.unique(np.linspace(0, len(drive) - 1, _CHECKED).astype(int)).tolist():
-        # The horizon is unknown without a camera; below the upper third most cameras show road, and a steep
-        # one shows its lines hardly any lower.
-        image = drive.image(k)
-        counts.append(len(find_edges(image[image.shape[0] // 3 :], settings).uv_px))
-    if np.median(counts) < _LEAST_EDGES:
+    count = _usual_edges(drive, settings)
+    if count < _LEAST_EDGES:
         raise TrackingLostError(
-            f"{drive.path}: {np.median(counts):.0f} edge points in the lower two thirds of a frame, expected "
+            f"{drive.path}: {count:.0f} edge points in the lower two thirds of a frame, expected "
             f"{_LEAST_EDGES} at least: no line is visible"
         )
+
+
+def _texture_notes(drive: Drive, settings: EdgeSettings) -> list[str]:
+    """Say how many edge points are left out where the floor has a strong texture."""
+    count = _usual_edges(drive, settings)
+    if count <= MOST_POINTS:
+        return []
+    return [
+        f"the floor has a strong texture: {count:,.0f} edge points in the lower two thirds of a frame, the "
+        f"median; mapping uses at most {MOST_POINTS:,} of a frame, those most like borders of a marking"
+    ]
+
+
+def _usual_edges(drive: Drive, settings: EdgeSettings) -> float:
+    """Median number of edge points in the lower two thirds of a frame.
+
+    The horizon is unknown without a camera; below the upper third most cameras show road, and a steep one
+    shows its lines hardly any lower.
+    """
+    frames = np.unique(np.linspace(0, len(drive) - 1, _CHECKED).astype(int)).tolist()
+    lower = (drive.image(k)[drive.height // 3 :] for k in frames)
+    return float(np.median([len(find_edges(image, settings).uv_px) for image in lower]))
 
 
 def _blocks(drive: Drive, k: int) -> Float[np.ndarray, "d"]:

@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 from datagen.slam.commands import commands_of
 from datagen.slam.odometry.image_pairs import ImagePairs, OdometrySettings
+from datagen.slam.odometry.likely import likely_markings
 from datagen.slam.odometry.odometry import STEPS_HEIGHTS, at_limit, best_step, prominence, sampled_frames
 from datagen.slam.odometry.scans import Progress, seen_edges
 from datagen.slam.settings import GuessSettings
@@ -185,8 +186,9 @@ class _Search:
         self.periods = commands_of(drive.subset(slice(start, start + count)), guess.wheelbase_cm).periods
         #: Frames that are compared, by the number of pairs.
         self.compared = {most: self._compared(most) for most in (_FIRST_PAIRS, _PAIRS, _STEEP_PAIRS)}
+        everywhere = np.ones((drive.height, drive.width), np.uint8)
         self.edges = {
-            k: find_edges(drive.image(start + k), perception.edges)
+            k: likely_markings(find_edges(drive.image(start + k), perception.edges), everywhere)
             for k in sorted(set().union(*self.compared.values()))
         }
         self.size = drive.width, drive.height

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numba import njit
 
+from datagen.slam.odometry.likely import likely_markings
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
@@ -85,10 +86,10 @@ class Scans:
 
 
 def edges_of_drive(drive: Drive, settings: EdgeSettings, table: RoadTable) -> list[EdgePixels]:
-    """Find the edge pixels of every frame that see the road."""
+    """Find the edge pixels of every frame that see the road; on a textured floor, the likeliest markings."""
 
     def edges_of(image: UInt8[np.ndarray, "h w *c"]) -> EdgePixels:
-        return find_edges(image, settings, table.keep, table.scale, table.sample)
+        return likely_markings(find_edges(image, settings, table.keep, table.scale, table.sample), table.keep)
 
     found: list[EdgePixels] = []
     for first in range(0, len(drive), _AT_ONCE):

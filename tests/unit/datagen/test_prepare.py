@@ -61,6 +61,17 @@ def test_only_the_frames_that_were_asked_for_are_mapped(tmp_path):
         prepare(MapRequest(tmp_path / "drive", 40.0, frames=(100, 149)), MapSettings())
 
 
+def test_a_floor_of_strong_texture_is_named(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    with DriveWriter(tmp_path / "drive") as writer:
+        for k in range(70):
+            writer.add(rng.integers(0, 255, (48, 64, 3)).astype(np.uint8), 0.05 * k, throttle=0.2)
+    for most, named in ((6000, False), (100, True)):
+        monkeypatch.setattr("datagen.prepare.MOST_POINTS", most)
+        notes = prepare(MapRequest(tmp_path / "drive", 40.0), MapSettings()).notes
+        assert any("at most 100 of a frame" in note for note in notes) == named
+
+
 def test_a_map_is_known_by_all_that_it_is_made_from(tmp_path, monkeypatch):
     write_drive(tmp_path / "drive")
     write_drive(tmp_path / "other")
