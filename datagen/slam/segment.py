@@ -592,7 +592,8 @@ class _DenseSegment:
         if not (along < MAX_MISSED[0] and across < MAX_MISSED[1]):
             return None
         loops = loop_pairs(revisits, self.part)
-        closed = self.adjust(self.observed, replace(opened, poses=poses), free=self.free, loops=loops)
+        start = replace(opened, poses=poses)
+        closed = self.adjust(self.observed, start, free=self.free, loops=loops, with_sigma=False)
         return (
             _Closure(revisits, closed, self.view.road) if closed.misfit < MAX_MISFIT * opened.misfit else None
         )

@@ -251,6 +251,16 @@ def lift_points(state, points, part, out, out_by, out_half):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
+def _moved(poses, turns, frames, a, b):
+    """Return a road point of frame i (ahead of the rear axle, left) in frame j; see :func:`_compare`."""
+    (ci, si, cj, sj), (i, j) = turns, frames
+    dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
+    dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
+    return cj * dx + sj * dy, cj * dy - sj * dx
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+@no_type_check
 def associate(state, pairs, part, points, lifted, lifted_half, edges, gate_px, inner, seen, in_view, links):
     """Find for every point of frame i the nearest edge of frame j that brightens in the same direction.
 
@@ -283,29 +293,21 @@ def associate(state, pairs, part, points, lifted, lifted_half, edges, gate_px, i
     for k in range(part[0], part[1]):
         i, j = pairs[k, 0], pairs[k, 1]
         set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
-        ci, si = np.cos(poses[i, 2]), np.sin(poses[i, 2])
-        cj, sj = np.cos(poses[j, 2]), np.sin(poses[j, 2])
+        turns = np.cos(poses[i, 2]), np.sin(poses[i, 2]), np.cos(poses[j, 2]), np.sin(poses[j, 2])
         for p in range(points.starts[i], points.starts[i + 1]):
-            u = v = nu = nv = np.nan
-            for end in range(2):
-                a = lifted[p, 0] if end == 0 else lifted_half[p, 0]
-                b = lifted[p, 1] if end == 0 else lifted_half[p, 1]
-                dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
-                dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
-                forward, left = cj * dx + sj * dy, cj * dy - sj * dx
-                u1, v1 = project_point(state.fisheye, state.lens, view, forward, left)
-                if end == 0:
-                    u, v = u1, v1
-                else:
-                    nu, nv = u1 - u, v1 - v
+            a, b = _moved(poses, turns, (i, j), lifted[p, 0], lifted[p, 1])
+            u, v = project_point(state.fisheye, state.lens, view, a, b)
+            if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+                continue
+            if not inner[int(v + 0.5), int(u + 0.5)]:
+                continue
+            a, b = _moved(poses, turns, (i, j), lifted_half[p, 0], lifted_half[p, 1])
+            u_half, v_half = project_point(state.fisheye, state.lens, view, a, b)
+            nu, nv = u_half - u, v_half - v
             length = np.sqrt(nu * nu + nv * nv)
             # Half a pixel became this long: so uncertain is the place of the point in the other image.
             stretch = 2.0 * length
             if not 1e-9 < stretch < _MAX_STRETCH:
-                continue
-            if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
-                continue
-            if not inner[int(v + 0.5), int(u + 0.5)]:
                 continue
             seen[0, p] += 1
             in_view[k] += 1
@@ -356,11 +358,8 @@ def _compare(state, edges, turns, frames, moved, moved_by, q, view, by, jac):
     """
     poses = state.poses
     ci, si, cj, sj = turns
-    i, j = frames
     a, b = moved[0], moved[1]
-    dx = poses[i, 0] + ci * a - si * b - poses[j, 0]
-    dy = poses[i, 1] + si * a + ci * b - poses[j, 1]
-    forward, left = cj * dx + sj * dy, cj * dy - sj * dx
+    forward, left = _moved(poses, turns, frames, a, b)
     u, v = project_with_jacobian(state.fisheye, state.lens, view, forward, left, by)
     nu, nv = edges.normals[q, 0], edges.normals[q, 1]
     g_f, g_l = nu * by[0, 0] + nv * by[1, 0], nu * by[0, 1] + nv * by[1, 1]
@@ -384,26 +383,15 @@ def _compare(state, edges, turns, frames, moved, moved_by, q, view, by, jac):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 @no_type_check
-def sum_scores(
-    state,
-    pairs,
-    edges,
-    lifted,
-    lifted_by,
-    links,
-    starts,
-    point_weight,
-    cauchy_px,
-    through_frames,
-    errors_px,
-    groups,
-    sums,
-):
-    """Add up the scores of the camera, J^T w e with the frames eliminated, over groups of links.
+def link_scores(
+    state, pairs, part, edges, lifted, lifted_by, links, starts, point_weight, cauchy_px, through, scores
+):  # fmt: skip
+    """Find what an error of each link adds to the camera's scores, J^T w with the frames eliminated.
 
     Args:
         state: See :class:`datagen.slam.adjustment.state.BundleState`.
         pairs: Pairs of frames, i and j.
+        part: First pair whose links are looked at, and one behind the last.
         edges: Edges of all frames.
         lifted: Road point of each compared pixel.
         lifted_by: Its Jacobian by the camera parameters.
@@ -411,15 +399,13 @@ def sum_scores(
         starts: First link of each pair, and one behind the last.
         point_weight: Inverse variance of each compared pixel.
         cauchy_px: Scale of the loss, see :func:`accumulate`.
-        through_frames: Change of each frame's numbers with each of the camera's, ``N_FRAME`` rows per frame.
-        errors_px: e of each link; w is that of its residual.
-        groups: Group of each link.
-        sums: Added to, a row per group.
+        through: Change of each frame's numbers with each of the camera's, ``N_FRAME`` rows per frame.
+        scores: Filled where a link has a residual, a row per link.
     """
     poses, tilt = state.poses, state.tilt
     view, by = np.empty(N_VIEW), np.empty((2, 2 + N_CAMERA))
     jac = np.empty(2 * N_FRAME + N_CAMERA)
-    for k in range(pairs.shape[0]):
+    for k in range(part[0], part[1]):
         i, j = pairs[k, 0], pairs[k, 1]
         set_view(state.mount, tilt[j, 0], tilt[j, 1], view)
         turns = np.cos(poses[i, 2]), np.sin(poses[i, 2]), np.cos(poses[j, 2]), np.sin(poses[j, 2])
@@ -429,13 +415,13 @@ def sum_scores(
             if not np.isfinite(e):
                 continue
             s = e / (sigma * cauchy_px)
-            scaled = errors_px[r] * point_weight[p] / ((1.0 + s * s) * sigma * sigma)
+            weight = point_weight[p] / ((1.0 + s * s) * sigma * sigma)
             for c in range(N_CAMERA):
                 total = jac[2 * N_FRAME + c]
                 for m in range(N_FRAME):
-                    total += jac[m] * through_frames[N_FRAME * i + m, c]
-                    total += jac[N_FRAME + m] * through_frames[N_FRAME * j + m, c]
-                sums[groups[r], c] += scaled * total
+                    total += jac[m] * through[N_FRAME * i + m, c]
+                    total += jac[N_FRAME + m] * through[N_FRAME * j + m, c]
+                scores[r, c] = weight * total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 
-from datagen.slam.adjustment.kernels import N_FRAME
+from datagen.slam.adjustment.kernels import N_FRAME, Pixels
 from lanenet.config import Settings
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.pixels import EdgePixels
@@ -112,6 +113,16 @@ class Observations:
     speed_recorded: bool = False
     periods: Float[np.ndarray, "n"] | None = None
     uneven: Bool[np.ndarray, "n"] | None = None
+
+    @cached_property
+    def pixels(self) -> tuple[Pixels, Pixels]:
+        """Edges of all frames, as they were found, and those of each sorted by row, as the kernels search."""
+        counts = [len(one.uv_px) for one in self.edges]
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        uv = np.concatenate([one.uv_px for one in self.edges]).astype(np.float64)
+        normals = np.concatenate([one.normals for one in self.edges]).astype(np.float64)
+        by_row = np.lexsort((uv[:, 1], np.repeat(np.arange(len(counts)), counts)))
+        return Pixels(starts, uv, normals), Pixels(starts, uv[by_row], normals[by_row])
 
 
 @dataclass(frozen=True)
