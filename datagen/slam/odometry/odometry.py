@@ -48,6 +48,9 @@ _CLEARLY = 2.0
 #: sigma, all as logarithms; and the gain on its likelihood, which no neighbour adds to. Chosen: a few cells
 #: of the grid, and as strong as the pairs of a frame without gaps.
 _REFINED, _REFINED_STEPS, _REFINED_SIGMA, _REFINED_GAIN = 0.17, 13, 0.1, 4.0
+#: Turns of the grid to either side of the one between neighbours, at which images further apart are compared.
+#: Measured on ``usi_mat``: all others move the turns by 1e-4 rad in 99 % of its frames, by 0.003 at most.
+_WINDOW = 10
 #: Least commanded step relative to the typical one: a car that is commanded to stand may still roll.
 LEAST_STEP = 0.1
 
@@ -274,10 +277,18 @@ class Evidence:
     ) -> Float[np.ndarray, "w t"]:
         """Compare a frame with those before it; over a gap, several turns in a cell of the grid are tried."""
         turns, count = self.grid.turns_rad, _turns_per_cell(self.time[k])
+        near = slice(0, len(turns))
+        if rates is not None:
+            middle = int(np.argmin(np.abs(turns - rates[k])))
+            near = slice(max(middle - _WINDOW, 0), middle + _WINDOW + 1)
         within = (turns[1] - turns[0]) / count * (np.arange(count) - count // 2)
-        tried = (turns[:, None] + within).ravel()
+        tried = (turns[near, None] + within).ravel()
         found = self.images.fit(k, self.grid.steps, tried, self.relative, lags, rates)
-        return found.reshape(*self.grid.shape, count).max(axis=2)
+        found = found.reshape(len(found), -1, count).max(axis=2)
+        # Elsewhere the images are taken to fit as badly as they do anywhere near.
+        whole = np.repeat(found.min(axis=1, keepdims=True), len(turns), axis=1)
+        whole[:, near] = found
+        return whole
 
     def motion(self, curvature_per_cm: Float[np.ndarray, "n"] | None = None) -> Odometry:
         """Find the likeliest motion.
