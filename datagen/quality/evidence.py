@@ -18,17 +18,17 @@ from typing import Any, NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from numba import njit
-from scipy.ndimage import uniform_filter1d
 
 from datagen.quality.residuals import frame_edges, in_view, reference_scale
 from datagen.slam.camera.coarse import nudged
 from datagen.slam.commands import GAP_PERIODS, LONGEST_STEP, MOST_BRIDGED
 from datagen.slam.odometry.scans import lift_tilted
 from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.frame_lines import BEHIND_CM, SAMPLE_CM
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.frames import car_from_map
-from lanenet.geometry.lane import N_POINTS, ROWS_CM
+from lanenet.geometry.lane import N_POINTS, ROWS_CM, row_crossings
 from lanenet.geometry.poses import path_lengths
 
 #: Length of a place, and width of a bin across. Chosen: a tenth of a dash, a quarter of a narrow line.
@@ -54,17 +54,16 @@ _OWN, _PASS, _AROUND, _NEAR = 3, 5, 30, 2
 _FAR_CM = 100.0
 #: Half the length over which the turn of a line is taken. Chosen: a place in the middle of a corner.
 _TURN_CM = 8.0
-#: Where the lines are looked up around a frame, behind the front axle and ahead of it, [cm].
-_BEHIND_CM, _AHEAD_CM = 20.0, 60.0
+#: How far ahead of the front axle a line is followed, [cm]: a label further along it cannot be judged.
+_AHEAD_CM = 60.0
 #: A small step on the road, for the size of a pixel there, [cm].
 _SMALL_CM = 0.2
 
 
-#: By label; features by name; hits by row, place and column, see :class:`_Line`, and sums of them by label.
+#: By label; features by name; sums of hits by label, see :class:`_Line`.
 _Ints = Int[np.ndarray, "..."]
 _Floats = Float[np.ndarray, "..."]
 _Features = dict[str, Float[np.ndarray, "..."]]
-_Hits = UInt8[np.ndarray, "l t b"] | Int[np.ndarray, "l t b"]
 _Sums = Int[np.ndarray, "_ _"]
 
 
@@ -342,20 +341,16 @@ def _hits(points, normals, places, columns):
 
 
 def _labels(drive_map: DriveMap, one: _Line) -> _Labels:
-    ahead = np.arange(-_BEHIND_CM, drive_map.camera.wheelbase_cm + _AHEAD_CM, _PLACE_CM)
+    ahead = np.arange(-BEHIND_CM, drive_map.camera.wheelbase_cm + _AHEAD_CM, SAMPLE_CM)
     s_cm = one.s_cm[:, None] + one.sign[:, None] * ahead
     points = one.in_car(drive_map, one.rows, s_cm)
-    parts = []
-    for row, y_cm in enumerate(ROWS_CM):
-        crossed = (points[:, :-1, 1] <= y_cm) & (points[:, 1:, 1] > y_cm)
-        k = np.flatnonzero(crossed.any(axis=1))
-        m = crossed[k].argmax(axis=1)
-        x, y = points[k, m].T
-        dx, dy = (points[k, m + 1] - points[k, m]).T
-        share = (y_cm - y) / dy
-        label_s = s_cm[k, m] + share * (s_cm[k, m + 1] - s_cm[k, m])
-        parts.append((k, np.full(len(k), row), label_s, x + share * dx, dx / dy))
-    return _Labels(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    point, share = row_crossings(points[..., 1])
+    frame, row = np.nonzero(np.isfinite(share))
+    at, share = (frame, point[frame, row]), share[frame, row]
+    x, dx = points[at][:, 0], np.diff(points, axis=1)[at]
+    return _Labels(
+        frame, row, s_cm[at] + share * np.diff(s_cm)[at], x + share * dx[:, 0], dx[:, 0] / dx[:, 1]
+    )
 
 
 def _profile(sums: Int[np.ndarray, "m b"], usual: Float[np.ndarray, "m d"]) -> _Profile:
@@ -373,21 +368,11 @@ def _profile(sums: Int[np.ndarray, "m b"], usual: Float[np.ndarray, "m d"]) -> _
     return _Profile(met.mean(axis=1), met.min(axis=1), offset_cm, right_cm - left_cm, rival, views)
 
 
-def _running(hits: _Hits) -> Int[np.ndarray, "l t1 b"]:
-    """Sums of hits over the places before each, and over all of them."""
-    return np.cumsum(np.pad(hits, ((0, 0), (1, 0), (0, 0))), axis=1, dtype=np.int32)
-
-
-def _window(running: Int[np.ndarray, "l t1 b"], row: _Ints | int, centre: _Ints, half: int) -> _Sums:
+def _seen(hits: UInt8[np.ndarray, "l t b"], row: _Ints, centre: _Ints, half: int) -> _Sums:
     """Sum the hits of some rows over the places around some centres."""
-    first, last = (np.clip(centre + by, 0, running.shape[1] - 1) for by in (-half, half + 1))
+    running = np.cumsum(np.pad(hits, ((0, 0), (1, 0), (0, 0))), axis=1, dtype=np.int32)
+    first, last = (np.clip(centre + by, 0, hits.shape[1]) for by in (-half, half + 1))
     return np.asarray(running[row, last] - running[row, first])
-
-
-def _on_line(raster: _Sums, centre: _Ints, closed: bool) -> _Sums:
-    """Sum a raster of a line over the places around some, as far as a pass is looked at."""
-    around = np.pad(raster, ((_PASS, _PASS), (0, 0)), mode="wrap" if closed else "constant")
-    return _window(_running(around[None]), 0, centre + _PASS, _PASS)
 
 
 def _evidence(
@@ -408,7 +393,7 @@ def _evidence(
     place, view_pass = cells[i, step] % one.count, passes[rows[i]] + cells[i, step] // one.count
     total = _raster(place, hits, one.count)
     met = hits[:, one.borders].any(axis=1)
-    with_it = _around(_raster(place[met], hits[met], one.count), one.closed, _AROUND)
+    with_it = around(_raster(place[met], hits[met], one.count), one.closed, _AROUND)
     usual = 0.5 * with_it[:, :-1].reshape(one.count, 2, -1).sum(axis=1) / np.maximum(with_it[:, -1:], 1e-9)
     middle = cells[:, cells.shape[1] // 2] % one.count
     ahead = _profile(one.hits.sum(axis=1, dtype=np.int32), usual[middle])
@@ -418,33 +403,32 @@ def _evidence(
     of_row = np.full(len(near), -1)
     of_row[rows] = np.arange(len(rows))
     j = of_row[near[k]]
-    cell, base = one.cell(labels.s_cm), one.cell(one.s_cm[one.looked[j]])
+    cell = one.cell(labels.s_cm)
     at, label_pass = cell % one.count, passes[k] + cell // one.count
-    # On a lap the nearest frame may be beyond the seam.
-    beyond = (
-        cell - base - (one.count * np.rint((cell - base) / one.count).astype(np.int64) if one.closed else 0)
-    )
+    beyond = cell - one.cell(one.s_cm[one.looked[j]])
+    if one.closed:  # the nearest frame may be beyond the seam
+        beyond -= one.count * np.rint(beyond / one.count).astype(np.int64)
     centre = one.sign[one.looked[j]] * beyond - 1
     apart = np.abs(np.arange(cells.shape[1]) - centre[:, None]) + 1e6 * (one.hits[j, :, -1] == 0)
-    gap = np.where((j < 0) | (apart.min(axis=1) > 1e5), np.nan, apart.min(axis=1))
-    ahead_sums = _running(one.hits)
-    own_sums = _window(ahead_sums, j, np.where(gap > _OWN, apart.argmin(axis=1), centre), _OWN)
-    own_sums[np.isnan(gap)] = 0
+    gap, unseen = apart.min(axis=1), (j < 0) | (apart.min(axis=1) > 1e5)
+    own_sums = _seen(one.hits, j, np.where(gap > _OWN, apart.argmin(axis=1), centre), _OWN)
+    own_sums[unseen] = 0
     # Its pass, and all of them.
     pass_sums = np.zeros_like(own_sums)
     for number in np.unique(label_pass):
         now, then = label_pass == number, view_pass == number
-        pass_sums[now] = _on_line(_raster(place[then], hits[then], one.count), at[now], one.closed)
-    all_sums = _on_line(total, at, one.closed)
-    of_frame = np.where(j[:, None] < 0, 0, _window(ahead_sums, j, centre, _PASS))
+        raster = _raster(place[then], hits[then], one.count)
+        pass_sums[now] = around(raster, one.closed, _PASS)[at[now]]
+    all_sums = around(total, one.closed, _PASS)[at]
+    of_frame = np.where(j[:, None] < 0, 0, _seen(one.hits, j, centre, _PASS))
     own = _profile(own_sums, usual[at])
     mine = _profile(np.maximum(pass_sums - of_frame, 0), usual[at])
     others = _profile(all_sums - pass_sums, usual[at])
     # A line on one border only: that may be another edge, in the marking's middle.
     one_border = np.abs(np.diff(all_sums[:, one.borders], axis=1)[:, 0]) / np.maximum(all_sums[:, -1], 1)
-    near_sums = _around(total, one.closed, _NEAR)
+    near_sums = around(total, one.closed, _NEAR)
     borders = near_sums[:, one.borders].mean(axis=1)
-    met_cm = one.middle_cm(np.flatnonzero((borders >= 0.5 * near_sums[:, -1]) & (near_sums[:, -1] > 0.5)))
+    met_cm = one.middle_cm(np.flatnonzero((borders >= 0.5 * near_sums[:, -1]) & (near_sums[:, -1] > 0)))
     return {
         **own.features("own"),
         **mine.features("pass"),
@@ -464,11 +448,11 @@ def _raster(place: _Ints, hits: UInt8[np.ndarray, "m b"], count: int) -> _Sums:
     return raster
 
 
-def _around(sums: Int[np.ndarray, "p b"], closed: bool, half: int) -> Float[np.ndarray, "p b"]:
-    """Sum over the places around each one."""
-    size = min(2 * half + 1, len(sums))
-    mean = uniform_filter1d(sums.astype(np.float64), size, axis=0, mode="wrap" if closed else "constant")
-    return np.asarray(mean * size)
+def around(sums: Int[np.ndarray, "p b"], closed: bool, half: int) -> Int[np.ndarray, "p b"]:
+    """Sum over the places around each one, of a lap also across its seam."""
+    padded = np.pad(sums, ((half, half), (0, 0)), mode="wrap" if closed else "constant")
+    running = np.cumsum(np.pad(padded, ((1, 0), (0, 0))), axis=0)
+    return np.asarray(running[2 * half + 1 :] - running[: -2 * half - 1])
 
 
 def _distance_cm(line: LaneLine, s_cm: _Floats, to_cm: Float[np.ndarray, "q"]) -> _Floats:

@@ -14,7 +14,7 @@ import math
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import AfterValidator
 
 from lanenet.errors import ConfigError
@@ -96,15 +96,28 @@ def rows_of_polyline(line_car_cm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
     Returns:
         x at y = 0, 15, 30 cm, [cm], frame car.
     """
-    x, y = line_car_cm[:, 0], line_car_cm[:, 1]
-    result = np.full(len(ROWS_CM), np.nan)
-    for i, row in enumerate(ROWS_CM):
-        crossings = np.flatnonzero((y[:-1] <= row) & (y[1:] > row))
-        if crossings.size:
-            k = crossings[0]
-            t = (row - y[k]) / (y[k + 1] - y[k])
-            result[i] = x[k] + t * (x[k + 1] - x[k])
-    return result
+    x, y = np.pad(line_car_cm, ((0, 2), (0, 0)), constant_values=np.nan).T
+    point, share = (found[0] for found in row_crossings(y[None]))
+    return np.asarray(x[point] + share * (x[point + 1] - x[point]))
+
+
+def row_crossings(
+    y_cm: Float[np.ndarray, "n m"],
+) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Find where polylines first cross the label rows upwards.
+
+    Args:
+        y_cm: Of two and more points of each polyline, frame car.
+
+    Returns:
+        By polyline and row the point before the crossing, and the share of the way to the next point; NaN
+        where there is none.
+    """
+    crossed = (y_cm[:, :-1, None] <= ROWS_CM) & (y_cm[:, 1:, None] > ROWS_CM)
+    point = crossed.argmax(axis=1)
+    low, high = (np.take_along_axis(y_cm, at, axis=1) for at in (point, point + 1))
+    share = np.divide(ROWS_CM - low, high - low, out=np.full(low.shape, np.nan), where=crossed.any(axis=1))
+    return point, share
 
 
 def label_rows(line_car_cm: Float[np.ndarray, "m 2"], steepest: float = STEEPEST) -> Float[np.ndarray, "3"]:

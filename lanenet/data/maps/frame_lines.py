@@ -13,9 +13,9 @@ from lanenet.geometry.frames import car_from_map
 from lanenet.geometry.lane import BESIDE_DIVIDER_LANES, N_POINTS, ROWS_CM, STEEPEST, label_rows
 
 #: Spacing of a polyline's points. Chosen: chords of a 50 cm bend deviate by 0.1 mm.
-_SAMPLE_CM = 2.0
+SAMPLE_CM = 2.0
 #: Extent of the polylines: from behind the rear axle to beyond the far edge of the bird's-eye window (72 cm).
-_BEHIND_CM, _AHEAD_CM = 20.0, 90.0
+BEHIND_CM, _AHEAD_CM = 20.0, 90.0
 #: How far the car enters another lane at least, in lane widths; less is a swerve. Chosen: half of the 0.4 by
 #: which a car may be off the centre of its own lane (datagen/lanes/markings.py).
 _ENTERED = 0.2
@@ -87,7 +87,7 @@ def lines_of_frame(
     by_index = {line.index: line for line in lines}
     pair = (lane, lane + 1) if forward else (lane + 1, lane)
     bounds = [by_index.get(i) for i in pair]
-    along = np.arange(-_BEHIND_CM, wheelbase_cm + _AHEAD_CM, _SAMPLE_CM)
+    along = np.arange(-BEHIND_CM, wheelbase_cm + _AHEAD_CM, SAMPLE_CM)
     s = np.sort(s_cm + (along if forward else -along))
     for line in bounds:
         s = s if line is None else line.with_corners(s)

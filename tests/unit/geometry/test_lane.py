@@ -15,6 +15,7 @@ from lanenet.geometry.lane import (
     mirror_points,
     parabola_through,
     parabolas_from_points,
+    row_crossings,
     rows_of_polyline,
 )
 
@@ -90,6 +91,24 @@ def test_a_line_that_comes_back_is_answered_by_its_first_stretch() -> None:
     np.testing.assert_array_equal(rows_of_polyline(line), [0.0, 0.0, np.nan])
     # Walked the other way round, the stretch that recedes is the other one.
     np.testing.assert_array_equal(rows_of_polyline(line[::-1]), [60.0, 60.0, np.nan])
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_less_than_two_points_cross_no_row(count: int) -> None:
+    assert np.isnan(rows_of_polyline(np.zeros((count, 2)))).all()
+
+
+def test_crossings_of_several_lines_are_those_of_each() -> None:
+    rng = np.random.default_rng(3)
+    lines = rng.uniform(-20.0, 60.0, (40, 12, 2))
+    lines[rng.random((40, 12)) < 0.1] = np.nan
+    point, share = row_crossings(lines[..., 1])
+    for line, k, part in zip(lines, point, share, strict=True):
+        x = line[k, 0] + part * (line[k + 1, 0] - line[k, 0])
+        np.testing.assert_array_equal(x, rows_of_polyline(line))
+        known = np.isfinite(part)
+        y = line[k, 1] + part * (line[k + 1, 1] - line[k, 1])
+        np.testing.assert_allclose(y[known], np.array(ROWS_CM)[known], atol=1e-9)
 
 
 def test_a_break_in_the_line_is_not_bridged() -> None:
