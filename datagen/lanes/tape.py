@@ -234,7 +234,7 @@ def _straight(
     for _ in range(_REWEIGHTED):
         means = [(weight[side] @ points_cm[side]) / weight[side].sum() for side in (right, ~right)]
         apart = points_cm - np.where(right[:, None], means[0], means[1])
-        along = np.linalg.svd(apart * np.sqrt(weight)[:, None], full_matrices=False)[2][0]
+        along = np.linalg.eigh((weight * apart.T) @ apart)[1][:, 1]
         normal = left_of(along[None])[0]
         weight = 1.0 / (1.0 + (apart @ normal / scale_cm) ** 2)
     # The middle is half-way between the lines of both borders.

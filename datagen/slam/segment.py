@@ -29,6 +29,7 @@ from datagen.slam.loops.consistency import (
     without_contradicted,
 )
 from datagen.slam.loops.parts import (
+    JOINED,
     LEAST_TIED,
     carried,
     connected,
@@ -398,7 +399,6 @@ class _DenseSegment:
         solver.tell(_ADJUST, 2, 3)
         if self.find_camera:
             rivals = [self.adjust_with_camera(one, _together(matched, one.revisits)) for one in rivals]
-            rivals = [one for one in rivals if one.bundle.misfit < MAX_MISFIT * opened.misfit]
         closure = self.likeliest(rivals, opened)
         bundle, road = (opened, view.road) if closure is None else (closure.bundle, closure.road)
         solver.tell(_ADJUST, 3, 3)
@@ -453,13 +453,15 @@ class _DenseSegment:
             found, since a wrong camera makes up for much.
         """
         found: list[_Closure] = []
-        tried: set[tuple[tuple[int, int], ...]] = set()
+        tried: set[tuple[tuple[int, int, int], ...]] = set()
         for rivals in self.sets_to_try(opened.poses, matched):
             for group in rivals:
                 grown = self.grown(opened.poses, group, matched)
-                if _pairs(grown) in tried:
+                # The same pairs with other whole turns between them are another way around.
+                key = tuple(sorted((r.earlier, r.later, r.turns) for r in grown))
+                if key in tried:
                     continue
-                tried.add(_pairs(grown))
+                tried.add(key)
                 closure = self.try_closure(grown, opened)
                 if closure is not None:
                     found.append(closure)
@@ -543,12 +545,13 @@ class _DenseSegment:
         group, breaks = connected(self.part, closure.revisits), np.flatnonzero(np.diff(self.part))
         breaks = breaks[group[breaks] == group[breaks + 1]]
         moved = carried(closure.bundle.poses, breaks, self.height)
+        joins = len(np.unique(self.part)) - len(np.unique(group))
         within = [r for r in closure.revisits if self.part[r.earlier] == self.part[r.later]]
         missed = heading_drift(opened.poses, within)[1] if within else 0.0
         gaps = self.view.commands.periods[self.view.commands.periods <= MOST_BRIDGED]
         laps = max(float(np.ptp(opened.poses[:, 2])) / (2.0 * np.pi), 1.0)
         variance = _DRIFT_RAD[self.find_camera] ** 2 + np.sum(gaps > 1.0) / laps * _GAP_RAD**2
-        return float(0.5 * missed**2 / variance) + moved - _EXPLAINED * len(closure.revisits)
+        return float(0.5 * missed**2 / variance) + moved - JOINED * joins - _EXPLAINED * len(within)
 
     def likeliest(self, rivals: Sequence[_Closure], opened: BundleResult) -> _Closure | None:
         """Choose among closures that go around by other ways; None if there are none.
@@ -595,9 +598,9 @@ class _DenseSegment:
         loops = loop_pairs(revisits, self.part)
         start = replace(opened, poses=poses)
         closed = self.adjust(self.observed, start, free=self.free, loops=loops, with_sigma=False)
-        # A focal length that is off by 4 % trebles the misfit of the true closure, and is found with it only.
-        fits = self.find_camera or closed.misfit < MAX_MISFIT * opened.misfit
-        return _Closure(revisits, closed, self.view.road) if fits else None
+        return (
+            _Closure(revisits, closed, self.view.road) if closed.misfit < MAX_MISFIT * opened.misfit else None
+        )
 
     def adjust_with_camera(self, closure: _Closure, matched: list[Revisit]) -> _Closure:
         """Adjust all of the camera with the poses, in rounds: another camera sees other edges on the road."""

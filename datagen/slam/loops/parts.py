@@ -27,9 +27,13 @@ _LEAST_PLACES = 2
 #: Placements of one part on another that are compared. Chosen: those on both corridors of an office, each in
 #: both directions.
 _MOST_RIVALS = 4
-#: Scale of the way that a car is carried or rolls over a break of the recording, in camera heights. Chosen:
-#: two or three lengths of a car.
-_CARRIED_HEIGHTS = 3.0
+#: Standard deviation of the way over which a car is carried, turned round or rolls at a break of the
+#: recording, in camera heights, and likelihood of any other place beside the one where it was. Chosen: a
+#: length of a car and a half; one break of a hundred, since recordings also stop while the car drives.
+_CARRIED_HEIGHTS, _ELSEWHERE = 3.5, 0.01
+#: Log likelihood at most of places that agree, over places that look alike as a whole, as those of parallel
+#: corridors. Chosen: it outweighs one break over which the car went elsewhere, but not two.
+JOINED = 6.0
 #: Frames of a part that show the road, without which its poses are not determined. Chosen: the motion model
 #: holds only changes of speed and of turn, which takes three frames; speed and turn themselves are left to
 #: the images, and a fourth frame checks them.
@@ -45,8 +49,8 @@ def placing_revisits(
     """Choose the revisits that place parts on each other, as many as agree, and no part twice.
 
     Places that look alike place a part here or there, as on one of two parallel corridors. Most often a car
-    goes on near where it was stopped, turned round or put down: of rival sets of revisits that one counts
-    which is the largest, less what :func:`carried` costs.
+    goes on near where it was stopped, turned round or put down: rival sets of revisits are compared by their
+    number, as far as it counts, less what :func:`carried` costs; one that costs more is not believed.
 
     Args:
         poses: Poses, each part in shape, in any place.
@@ -74,20 +78,21 @@ def placing_revisits(
             sets.append(agreeing)
             found = [r for r in found if all(r is not one for one in agreeing)]
 
-    def joined(agreeing: list[Revisit]) -> tuple[float, Float[np.ndarray, "n 3"]]:
-        """How likely a set is, and the poses with the group of the later visits moved as it says."""
+    def joined(agreeing: list[Revisit]) -> tuple[tuple[float, int], Float[np.ndarray, "n 3"]]:
+        """How likely a set is, with its size, and the poses with the group of the later visits moved."""
         r, trial = agreeing[0], placed.copy()
         a, b = group[r.earlier], group[r.later]
         mine = group == b
         trial[mine] = moved_rigidly(placed[mine], placed[r.later], compose(placed[r.earlier], r.relative))
         ends = np.sort(np.stack([group[:-1], group[1:]]), axis=0)
         breaks = np.flatnonzero((ends[0] == min(a, b)) & (ends[1] == max(a, b)))
-        return len(agreeing) - carried(trial, breaks, camera_height_cm), trial
+        likelihood = min(len(agreeing), JOINED) - carried(trial, breaks, camera_height_cm)
+        return (likelihood, len(agreeing)), trial
 
     chosen: list[Revisit] = []
     while sets:
         likeliest = max(sets, key=lambda one: joined(one)[0])
-        likelihood, trial = joined(likeliest)
+        (likelihood, _), trial = joined(likeliest)
         if likelihood < 0.0:
             break
         placed, chosen = trial, chosen + likeliest
@@ -104,11 +109,9 @@ def carried(poses: Float[np.ndarray, "n 3"], breaks: Int[np.ndarray, "b"], camer
         breaks: Last frames before breaks of the recording.
         camera_height_cm: Sets the scale.
     """
-    off = np.diff(poses[np.stack([breaks, breaks + 1]), :2], axis=0)[0] / (
-        _CARRIED_HEIGHTS * camera_height_cm
-    )
-    # Of a Cauchy distribution in the plane.
-    return 1.5 * float(np.log1p(np.sum(off**2, axis=1)).sum())
+    way_cm = np.diff(poses[np.stack([breaks, breaks + 1]), :2], axis=0)[0]
+    near = np.exp(-0.5 * np.sum((way_cm / (_CARRIED_HEIGHTS * camera_height_cm)) ** 2, axis=1))
+    return -float(np.log((near + _ELSEWHERE) / (1.0 + _ELSEWHERE)).sum())
 
 
 def whole_turns(poses: Float[np.ndarray, "n 3"], revisit: Revisit) -> int:

@@ -300,7 +300,8 @@ def propose_turned(
         turned on the spot.
     """
     path, proposed = path_lengths(poses), []
-    facing_cm, spacing_cm = (h * camera_height_cm for h in (_FACING_HEIGHTS, settings.pair_heights))
+    # A corner is short, and little else tells where along the road the car is.
+    facing_cm, spacing_cm = (h * camera_height_cm for h in (_FACING_HEIGHTS, 0.5 * settings.pair_heights))
     for last in np.flatnonzero(np.diff(part)).tolist():
         first, stop = np.searchsorted(part, part[last]), np.searchsorted(part, part[last + 1], "right")
         shorter_cm = min(path[last] - path[first], path[stop - 1] - path[last + 1])
