@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,9 @@ from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.view import LEAST_POINTS
 from lanenet.data.drives import Drive
 from lanenet.data.segments import equal_runs
-from lanenet.errors import CalibrationError, TrackingLostError, counted
+from lanenet.errors import CalibrationError, MapFormatError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
+from lanenet.reading import parsing, read_json
 
 #: Sigmas of a height and a lane width that were measured with a ruler, relative. Chosen: half a centimetre of
 #: a height of 17 cm, half a centimetre of a lane.
@@ -57,7 +59,7 @@ class CameraOfDrive:
         notes: A sentence each.
         doubt: Why a camera that was found is unlikely to be right; "" where nothing speaks against it.
         sigma: Standard deviation of each of its numbers, see
-            :attr:`datagen.slam.camera.self_calibration.FoundCamera.sigma`; none where it was given.
+            :attr:`datagen.slam.camera.self_calibration.FoundCamera.sigma`; none where it was measured.
     """
 
     camera: Camera
@@ -109,7 +111,8 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
         TrackingLostError: If the drive shows too few edges of the road.
     """
     if prepared.camera is not None and not prepared.request.refine_camera:
-        return CameraOfDrive(prepared.camera)
+        sigma = sigma_of_earlier(prepared.request.camera_path)
+        return CameraOfDrive(prepared.camera, figures={"camera_sigma": sigma} if sigma else {}, sigma=sigma)
     drive = prepared.drive
     check_edges(drive, prepared.settings.perception.edges)
     found = find_camera(drive, prepared.camera, solver)
@@ -129,6 +132,25 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
         )
     notes = (found.note, *notes)
     return CameraOfDrive(found.camera, found.how, found.solved, figures, notes, doubt, found.sigma)
+
+
+def sigma_of_earlier(camera_path: Path | None) -> dict[str, float]:
+    """Return the sigmas of a camera that was found while an earlier drive was mapped; none for other cameras.
+
+    Args:
+        camera_path: The map's folder, or the camera file in it.
+
+    Raises:
+        MapFormatError: If the map's report cannot be read.
+    """
+    folder = camera_path if camera_path is None or camera_path.is_dir() else camera_path.parent
+    if folder is None or not (folder / "map.yaml").is_file():
+        return {}
+    file = folder / "report.json"
+    report = read_json(file, MapFormatError)
+    with parsing(f"{file}: sigmas of the camera", MapFormatError):
+        found = report.get("calibration", {}).get("sigma") or report.get("camera_sigma", {})
+        return {str(name): float(value) for name, value in found.items()}
 
 
 def fit_height(

@@ -204,7 +204,8 @@ def label_features(mapped: MappedDrive, figures: dict[str, Any] | None = None) -
     lines = list(_lines(drive_map, looked))
     _look(mapped, looked, lines)
     passes = _passes(drive_map)
-    sigma = ((figures or {}).get("calibration") or {}).get("sigma", {})
+    known = figures or {}
+    sigma = (known.get("calibration") or {}).get("sigma") or known.get("camera_sigma", {})
     found: dict[str, Float[np.ndarray, "n 6"]] = {}
     whole = np.full((n, 2, len(_Profile._fields)), np.nan)
     index, s_cm = np.zeros((n, N_POINTS), np.int64), np.full((n, N_POINTS), np.nan)

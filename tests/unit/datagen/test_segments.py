@@ -12,7 +12,7 @@ from datagen import prepare
 from datagen import segments as drive_segments
 from datagen.lanes.find import MappedSegment, check_lane
 from datagen.lanes.trace import TracedLane
-from datagen.segments import LanesOfDrive, SolvedDrive
+from datagen.segments import LanesOfDrive, SolvedDrive, sigma_of_earlier
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult
 from datagen.slam.camera.coarse import guessed_camera
@@ -23,8 +23,9 @@ from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Drive
+from lanenet.data.files import write_json, write_text
 from lanenet.data.maps.line import LaneLine, Side
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.errors import CalibrationError, MapFormatError, TrackingLostError
 from lanenet.perception.edges.road import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
@@ -230,3 +231,17 @@ def test_marks_on_the_floor_that_were_joined_are_no_line(monkeypatch):
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):
     mapped = _map(monkeypatch, made_up_drive(200, [70], first_frame=1000))
     assert len(mapped.segments) == 2 and not mapped.notes
+
+
+@pytest.mark.parametrize(
+    "report", [{"calibration": {"sigma": {"focal": 0.02}}}, {"camera_sigma": {"focal": 0.02}}]
+)
+def test_a_camera_of_an_earlier_map_brings_its_uncertainty_along(tmp_path, report):
+    write_text(tmp_path / "map.yaml", "")
+    write_json(tmp_path / "report.json", report)
+    assert sigma_of_earlier(tmp_path) == sigma_of_earlier(tmp_path / "camera.yaml") == {"focal": 0.02}
+    # A camera that was measured, in no map.
+    assert sigma_of_earlier(tmp_path / "elsewhere" / "camera.yaml") == sigma_of_earlier(None) == {}
+    write_json(tmp_path / "report.json", {"calibration": {"sigma": {"focal": "wide"}}})
+    with pytest.raises(MapFormatError, match=r"report\.json: sigmas of the camera"):
+        sigma_of_earlier(tmp_path)
