@@ -392,7 +392,7 @@ def mats(number: int, seed: int) -> TrapDrive:
     lane_cm = float(rng.uniform(19.0, 24.0))
     # From the right, in the direction of travel; it is mostly the second one.
     driven = int(rng.choice(4, p=(0.1, 0.7, 0.1, 0.1)))
-    radius_cm = float(rng.uniform(2.9, 3.5)) * lane_cm  # of the middle of the mat
+    radius_cm = float(rng.uniform(3.2, 3.8)) * lane_cm  # of the middle of the mat
     border, dashes = {"kind": "solid"}, {"kind": "dashed", "dash_cm": 12.0, "gap_cm": 12.0}
     painted: list[dict[str, Any]] = [border, dashes, border | {"colour": "yellow"}, dashes, border]
     car = car_like_people(rng, {"lane_width_cm": lane_cm})
