@@ -57,6 +57,16 @@ def test_a_wrong_camera_comes_back_when_the_loop_is_closed(seed):
     assert 0.0 < found.sigma["focal"] < 0.04 < SMALL.focal
 
 
+def test_sigmas_that_nobody_asked_for_are_left_out():
+    camera, (road, loops) = fisheye(), _around(80)
+    observed, start = Observations(pixels(road, camera)), BundleEstimate.level(road.poses, camera)
+    known, left_out = (
+        adjust(observed, start, SMALL, _rng(), loops=loops, with_sigma=w) for w in (True, False)
+    )
+    np.testing.assert_array_equal(known.poses, left_out.poses)
+    assert min(known.sigma.values()) > 0.0 and not any(left_out.sigma.values())
+
+
 @pytest.mark.slow
 def test_an_error_that_all_frames_share_is_not_averaged_away():
     camera, (road, loops) = fisheye(), _around()
