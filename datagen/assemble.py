@@ -163,7 +163,7 @@ def assemble(
         lane.scaled(factor),
         map_edges(segments, drive.frames, factor),
         _in_order(segments, [s.solved.open_poses for s in segments]) * _pose_scale(factor),
-        segment_figures(segments, drive.frames, factor),
+        segment_figures(segments, factor),
         free_lane_cm(segments),
         factor,
     )

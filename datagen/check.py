@@ -13,27 +13,13 @@ from datagen.assemble import AssembledMap
 from datagen.lanes.trace import other_lane
 from datagen.prepare import PreparedDrive
 from datagen.quality.evidence import label_features
-from datagen.quality.figures import (
-    map_evidence,
-    map_figures,
-    map_notes,
-    steering_answer,
-)
+from datagen.quality.figures import map_evidence, map_notes, steering_answer
 from datagen.quality.label_error import doubted_by, predict_errors
-from datagen.quality.measure import (
-    VERDICT_REACH_CM,
-    MapQuality,
-    WrongSection,
-    label_evidence,
-    measure_map,
-    quality_figures,
-    withheld_figures,
-    wrong_sections,
-)
-from datagen.quality.residuals import summarise
+from datagen.quality.measure import MapQuality, WrongSection, frame_status, label_evidence, wrong_sections
+from datagen.quality.residuals import Residuals, coverage, held_out_residuals, robust_sd
 from datagen.quality.verdict import Verdict, judge
 from lanenet.data.drives import Drive
-from lanenet.data.maps.mapped_drive import MappedDrive, points_text
+from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.errors import TrackingLostError
 from lanenet.geometry.lane import SIDES
 
@@ -80,30 +66,24 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
         CalibrationError: If they show one line only, but there is a lane of another width.
     """
     drive, drive_map, free_cm = prepared.drive, assembled.drive_map, assembled.free_lane_cm
-    figures = map_figures(drive_map, assembled.segments)
-    notes = map_notes(drive_map, figures, len(drive), prepared.camera is not None, free_cm)
+    notes = map_notes(drive_map, assembled.segments, len(drive), free_cm is not None)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
     mapped, quality = compare_with_frames(mapped, camera_figures)
     drive_map = mapped.drive_map
-    check_lines_seen(quality, drive, drive_map.meta.lane_width_cm, free_cm)
-    figures |= quality_figures(quality)
-    figures["withheld"] = withheld_figures(drive_map, quality)
-    figures["lane_width"] = asdict(assembled.lane)
-    steering = steering_answer(mapped)
-    figures["steering_correlation"] = None if steering is None else steering.correlation
-    figures["pauses"] = prepared.pauses
+    check_lines_seen(quality.held_out, drive, drive_map.meta.lane_width_cm, free_cm)
     request = prepared.request
-    figures["given"] = {
-        "camera_height_cm": request.camera_height_cm,
-        "tape_width_cm": request.tape_width_cm,
+    figures = quality.figures(drive_map) | {
+        "segments_mapped": assembled.segments,
+        "lane_width": asdict(assembled.lane),
+        "steering_correlation": steering_answer(mapped),
+        "pauses": prepared.pauses,
+        "given": {
+            "camera_height_cm": request.camera_height_cm,
+            "tape_width_cm": request.tape_width_cm,
+        },
     }
-    labelled = f"{100.0 * quality.labelled_share:.0f} % of the frames have labels"
-    notes.append(f"{labelled}; {points_text(quality.point_shares)}")
-    labels = label_evidence(mapped, quality)
-    figures["labels"] = asdict(labels)
-    verdict = judge(
-        map_evidence(drive_map, camera_figures | figures, labels, free_cm), prepared.settings.verdict
-    )
+    evidence = map_evidence(drive_map, camera_figures | figures, quality, free_cm)
+    verdict = judge(evidence, prepared.settings.verdict)
     meta = drive_map.meta.model_copy(update={"verdict": verdict.grade, "state": verdict.state})
     mapped = replace(mapped, drive_map=replace(drive_map, meta=meta))
     return CheckedMap(mapped, quality, verdict, figures | {"verdict": asdict(verdict)}, tuple(notes))
@@ -122,9 +102,10 @@ def compare_with_frames(
         for segment, found in drive_map.lines.items()
     }
     mapped = replace(mapped, drive_map=replace(drive_map, lines=lines, errors=errors))
-    quality = measure_map(mapped)
-    doubted = doubted_by(features, errors, np.isfinite(quality.points_cm))
-    return mapped, replace(quality, wrong=tuple(wrong), wrong_share=share, doubted=doubted)
+    status, points_cm = frame_status(mapped)
+    doubted = doubted_by(features, errors, np.isfinite(points_cm))
+    labels = label_evidence(mapped.drive_map, status, points_cm, doubted)
+    return mapped, MapQuality(held_out_residuals(mapped), status, points_cm, labels, wrong, share)
 
 
 def _sections(wrong: Sequence[WrongSection], segment: int, index: int) -> Float[np.ndarray, "w 2"]:
@@ -133,12 +114,12 @@ def _sections(wrong: Sequence[WrongSection], segment: int, index: int) -> Float[
 
 
 def check_lines_seen(
-    quality: MapQuality, drive: Drive, lane_width_cm: float, free_lane_cm: float | None
+    held_out: Residuals, drive: Drive, lane_width_cm: float, free_lane_cm: float | None
 ) -> None:
     """Refuse lines that held-out frames do not show: clutter along the path.
 
     Args:
-        quality: The map compared with its held-out frames.
+        held_out: Residuals of the map's held-out frames.
         drive: The drive.
         lane_width_cm: The given lane width.
         free_lane_cm: Lane width found without the given one, if it fits better; else None.
@@ -147,29 +128,26 @@ def check_lines_seen(
         TrackingLostError: If the frames show at most one of the lines; names the coverage.
         CalibrationError: If they show at most one, but there is a lane of another width.
     """
-    near = quality.near
-    coverage = summarise(near).coverage
-    if coverage < _LEAST_COVERAGE:
+    share = coverage(np.concatenate(held_out[:2]))
+    if share < _LEAST_COVERAGE:
         raise TrackingLostError(
-            f"{drive.path}: no lane: held-out frames show an edge along {100.0 * coverage:.0f} % of the "
+            f"{drive.path}: no lane: held-out frames show an edge along {100.0 * share:.0f} % of the "
             f"borders of its lines, expected {100.0 * _LEAST_COVERAGE:.0f} % at least"
         )
-    lines = {side: summarise(near.select(near.right == (side == "right"))) for side in SIDES}
-    sd_px = {side: line.robust_sd_px * quality.scale for side, line in lines.items()}
-    chance = summarise(quality.chance.select(quality.chance.ahead_cm < VERDICT_REACH_CM)).coverage
+    lines = {side: (coverage(own), robust_sd(own)) for side, own in zip(SIDES, held_out[:2], strict=True)}
+    by_chance = _BY_CHANCE * coverage(held_out.chance)
     clutter = [
         side
-        for side in SIDES
-        if lines[side].coverage < _CLUTTER_COVERAGE
-        and (sd_px[side] > _CLUTTER_PX or lines[side].coverage < _BY_CHANCE * chance)
+        for side, (met, sd_px) in lines.items()
+        if met < _CLUTTER_COVERAGE and (sd_px > _CLUTTER_PX or met < by_chance)
     ]
     if not clutter:
         return
     if free_lane_cm is not None:
         raise other_lane(lane_width_cm, free_lane_cm)
     found = " and ".join(
-        f"{100.0 * line.coverage:.0f} % of the {side} line's borders, {sd_px[side]:.1f} px off"
-        for side, line in lines.items()
+        f"{100.0 * met:.0f} % of the {side} line's borders, {sd_px:.1f} px off"
+        for side, (met, sd_px) in lines.items()
     )
     raise TrackingLostError(
         f"{drive.path}: {'one line only bounds the driven lane' if len(clutter) == 1 else 'no lane'}: "

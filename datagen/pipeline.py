@@ -226,10 +226,9 @@ def _draw(
 ) -> None:
     """Draw the map, some of its frames, and the page of the report."""
     mapped = checked.mapped
-    drive_map, opened = mapped.drive_map, assembled.open_poses
-    draw_map(folder / "map.png", drive_map, assembled.near_points, mapped.starts)
+    drive_map = mapped.drive_map
+    image = draw_map(folder / "map.png", drive_map, assembled.near_points, mapped.starts)
     shown = np.linspace(0, len(drive_map.frames) - 1, _SHOWN).astype(int)
     draw_contact_sheet(folder / "frames.png", mapped, shown)
-    png = (folder / "map.png").read_bytes()
-    page = report_page(mapped, checked.quality, checked.verdict, figures, opened, png, out)
+    page = report_page(mapped, checked.quality, checked.verdict, figures, image, out)
     write_text(folder / PAGE_NAME, page)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from numba import njit
 
-from datagen.quality.residuals import frame_edges, in_view, reference_scale
+from datagen.quality.residuals import COSINE, REACH_CM, frame_edges, in_view, reference_scale
 from datagen.slam.camera.coarse import nudged
 from datagen.slam.commands import GAP_PERIODS, LONGEST_STEP, MOST_BRIDGED
 from datagen.slam.odometry.scans import lift_tilted
@@ -32,11 +32,9 @@ from lanenet.geometry.lane import N_POINTS, ROWS_CM, row_crossings
 from lanenet.geometry.poses import path_lengths
 
 #: Length of a place, and width of a bin across. Chosen: a tenth of a dash, a quarter of a narrow line.
-_PLACE_CM, _BIN_CM = 2.0, 0.5
+PLACE_CM, _BIN_CM = 2.0, 0.5
 #: Distance along the road between frames that are looked at. Chosen: ten of them see each place.
 _FRAMES_CM = 3.0
-#: Distance ahead of the front axle up to which a frame sees a place. Chosen: one row beyond the labels.
-_REACH_CM = 45.0
 #: Largest distance across that is looked at: in cm, and in lane widths, where the lane's middle begins.
 _BESIDE_CM, _BESIDE_LANES = 16.0, 0.4
 #: Largest distance of a border that is met: in cm, and in pixels of an image 160 px wide where that is more.
@@ -45,8 +43,6 @@ _MET_CM, _MET_PX = 0.75, 2.0
 #: Least distance of a border that rivals the line, and largest one that counts for the line's offset. Chosen:
 #: labels with 1.5 cm are not worth having, and a line that is off by more has lost its marking.
 _RIVAL_CM, _OFFSET_CM = 1.5, 3.5
-#: Least cosine between line and border: a smooth line on the kink of a tape differs by up to 45 degrees.
-_COSINE = 0.64
 #: Half the windows, in places: of one frame, of a pass, of what lies beside the line everywhere, and of the
 #: places where it is met. Chosen: what is seen 7 or 10 cm from a label is of the same piece of tape.
 _OWN, _PASS, _AROUND, _NEAR = 3, 5, 30, 2
@@ -159,7 +155,7 @@ class _Line:
     @property
     def count(self) -> int:
         """Number of places along the line."""
-        return max(1, round((self.line.span_cm[1] - self.line.span_cm[0]) / _PLACE_CM))
+        return max(1, round((self.line.span_cm[1] - self.line.span_cm[0]) / PLACE_CM))
 
     def cell(self, s_cm: Float[np.ndarray, "*m"]) -> Int[np.ndarray, "*m"]:
         """Places of positions along the line, not wrapped; on a lap, a whole number of them fits."""
@@ -216,10 +212,9 @@ def label_features(mapped: MappedDrive, figures: dict[str, Any] | None = None) -
         index[at], s_cm[at] = one.line.index, labels.s_cm
         for name, values in (columns | _camera(drive_map, labels, sigma)).items():
             found.setdefault(name, np.full((n, N_POINTS), np.nan))[at] = values
-    by_side = _both_lines(whole[near])
-    found |= {name: np.repeat(values, len(ROWS_CM), axis=1) for name, values in by_side.items()}
-    for name, values in _pose(mapped, run, periods).items():
-        found[name] = np.repeat(values[:, None], N_POINTS, axis=1)
+    of_frame = {name: values[:, None] for name, values in _pose(mapped, run, periods).items()}
+    for name, values in (_both_lines(whole[near]) | of_frame).items():
+        found[name] = np.repeat(values, N_POINTS // values.shape[1], axis=1)
     found["row_cm"] = np.tile(ROWS_CM, (n, 2))
     values = np.stack(list(found.values()), axis=-1).astype(np.float32)
     return LabelFeatures(tuple(found), values, index, s_cm)
@@ -266,7 +261,7 @@ def _lines(drive_map: DriveMap, looked: Int[np.ndarray, "m"]) -> Iterator[_Line]
     """The lines of a map with the frames between whose lines they are, not looked at yet."""
     most_cm = min(_BESIDE_CM, _BESIDE_LANES * drive_map.meta.mapped_lane_cm)
     columns = 2 * (2 * int(most_cm / _BIN_CM) + 1) + 1
-    steps = int((drive_map.camera.wheelbase_cm + _REACH_CM + 10.0) / _PLACE_CM)
+    steps = int((drive_map.camera.wheelbase_cm + REACH_CM + 10.0) / PLACE_CM)
     for segment, lines in drive_map.lines.items():
         by_index = {line.index: line for line in lines}
         for line in lines:
@@ -298,20 +293,18 @@ def _look(mapped: MappedDrive, looked: Int[np.ndarray, "m"], lines: list[_Line])
     for k, edges, keep in frame_edges(mapped, looked):
         tilted = drive_map.camera_at(k)
         (road,) = lift_tilted([edges], drive_map.camera, drive_map.tilt_rad[[k]])
-        near = road.points_cm[:, 1] < _REACH_CM + _BESIDE_CM
+        near = road.points_cm[:, 1] < REACH_CM + _BESIDE_CM
         for hits, own in views.get(k, []):
             at, along, widths = own[:, :2], own[:, 2:4], own[:, 4]
             right = np.stack([along[:, 1], -along[:, 0]], axis=1)
-            three = tilted.project_ground(
-                np.concatenate([at, at + _SMALL_CM * right, at + _SMALL_CM * along])
-            )
-            uv, beside, ahead = three.reshape(3, -1, 2)
-            shown = (at[:, 1] >= 0.0) & (at[:, 1] < _REACH_CM) & in_view(uv, beside, keep)
+            corners = np.concatenate([at, at + _SMALL_CM * right, at + _SMALL_CM * along])
+            uv, beside, ahead = tilted.project_ground(corners).reshape(3, -1, 2)
+            shown = (at[:, 1] >= 0.0) & (at[:, 1] < REACH_CM) & in_view(uv, beside, keep)
             # Of a pixel, across the line and along it.
             across_cm, along_cm = (_SMALL_CM / np.hypot(*(end - uv).T) for end in (beside, ahead))
             met_cm = np.maximum(_MET_CM, met_px * across_cm)
             # Far ahead, rows of pixels are further apart than places: half of that, and a little more.
-            reach_cm = np.maximum(0.5 * _PLACE_CM, 0.6 * along_cm)
+            reach_cm = np.maximum(0.5 * PLACE_CM, 0.6 * along_cm)
             places = np.column_stack([at, right, widths, met_cm, reach_cm])[shown]
             hits[shown] = _hits(road.points_cm[near], road.normals[near], places, hits.shape[1])
 
@@ -328,7 +321,7 @@ def _hits(points, normals, places, columns):
         for j in range(len(points)):
             dx, dy = points[j, 0] - x, points[j, 1] - y
             agree = normals[j, 0] * right_x + normals[j, 1] * right_y
-            if abs(dy * right_x - dx * right_y) > reach_cm or abs(agree) < _COSINE:
+            if abs(dy * right_x - dx * right_y) > reach_cm or abs(agree) < COSINE:
                 continue
             # The left border brightens to the right.
             d = dx * right_x + dy * right_y + (0.5 if agree > 0.0 else -0.5) * width

@@ -11,6 +11,7 @@ Source:
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import cache
 from importlib.resources import as_file, files
 from typing import NamedTuple
@@ -126,9 +127,8 @@ def doubted_by(
         replaced = (mine | unseen) if kind == "unseen" else (mine & ~unseen)
         _, off_1, off_3 = _predict(features.names, np.where(replaced, usual, rows))
         without.append(np.maximum(off_1 / MAX_OFF_1, off_3 / MAX_OFF_3))
-    counts = np.bincount(np.argmin(without, axis=0), minlength=len(KINDS))
-    shares = zip(KINDS, (counts / len(rows)).tolist(), strict=True)
-    return dict(sorted(((name, share) for name, share in shares if share), key=lambda item: -item[1]))
+    counts = Counter(np.array(list(KINDS))[np.argmin(without, axis=0)].tolist())
+    return {kind: count / len(rows) for kind, count in counts.most_common()}
 
 
 def _predict(names: tuple[str, ...], values: Float32[np.ndarray, "m f"]) -> Float[np.ndarray, "3 m"]:

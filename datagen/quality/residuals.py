@@ -1,15 +1,16 @@
 """Residuals: distance in pixels between the projected borders of the lane lines and the edges of a frame.
 
+Of a map its held-out frames are measured, which have no say in the lines. Their edges still find their own
+poses, without which they could not be compared: what all poses share is not seen.
+
 On a textured floor there is always some edge close by. So an edge counts only if it brightens towards the
-marking, as the border does; on a map of dark markings, if it darkens towards it. Two coverages put the
-residuals into perspective: the share of the border in view that met an edge, and the same share for a line
-shifted off its marking.
+marking, as the border does; on a map of dark markings, if it darkens towards it. A line shifted off its
+marking shows how many edges are met by chance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple, no_type_check
 
 import numpy as np
@@ -20,77 +21,70 @@ from datagen.slam.odometry.scans import edges_of_drive
 from datagen.slam.stripes import true_borders
 from datagen.slam.view import mapping_range
 from lanenet.data.maps.frame_lines import FrameLines
-from lanenet.data.maps.mapped_drive import MappedDrive
+from lanenet.data.maps.mapped_drive import MappedDrive, lines_at
 from lanenet.geometry.camera import Camera
-from lanenet.geometry.lane import SIDES
 from lanenet.perception.edges.pixels import EdgePixels
 from lanenet.perception.edges.road import RoadTable
 
 #: Image width to which pixels are converted so that drives can be compared: that of Donkeycar images.
-REFERENCE_WIDTH = 160.0
-#: Width of road, [cm], that a pixel of such an image shows so far ahead, [cm], at least: one that sees it
-#: more finely, through a long lens or from nearby, is judged by the same lengths, not by smaller ones.
+_REFERENCE_WIDTH = 160.0
+#: Width of road, [cm], that a pixel of such an image shows at the far end of what counts, at least: one that
+#: sees it more finely, through a long lens or from nearby, is judged by the same lengths, not smaller ones.
 #: Measured: 315 simulated cameras and three real ones show 0.43 cm and more; that of `blue_tape` 0.14 cm.
-_FINEST_CM, _FINEST_AHEAD_CM = 0.45, 45.0
+_FINEST_CM = 0.45
+#: Distance ahead of the front axle up to which a frame is compared. Chosen: one row beyond the labels.
+REACH_CM = 45.0
 #: Largest distance of an edge from its border, in pixels of such an image. Chosen: eight times the residuals
 #: of good maps.
-GATE_PX = 4.0
-#: Least cosine between the gradients of edge and border. Chosen: 37 degrees, for blur and noise.
-_MIN_AGREEMENT = 0.8
-#: Distance of the samples along a border. Chosen: finer than a pixel at the far end of the bands.
-_STEP_CM = 1.0
-#: Limits of the distance bands ahead of the front axle: the label rows and beyond.
-BANDS_CM = (0.0, 15.0, 30.0, 45.0, 90.0)
+_GATE_PX = 4.0
+#: Least cosine between line and border: a smooth line on the kink of a tape differs by up to 45 degrees.
+COSINE = 0.64
 
 
-def reference_scale(camera: Camera) -> float:
-    """Reference pixels per pixel of the image: those of an image 160 px wide that shows the road as usual."""
-    m = camera.mounting
-    # A place that it sees, wherever it is.
-    ahead_cm = max(_FINEST_AHEAD_CM, m.ahead_of_front_axle_cm + m.height_cm)
-    left, right = camera.project_ground(np.array([[-0.5, ahead_cm], [0.5, ahead_cm]]))
-    px_per_cm = float(np.hypot(*(right - left)))
-    return min(REFERENCE_WIDTH / camera.width, 1.0 / (_FINEST_CM * px_per_cm))
-
-
-class BorderSamples(NamedTuple):
-    """Places on the borders of the lines that are in view of a frame, with the residuals there.
+class Residuals(NamedTuple):
+    """Distances across the borders in view to the nearest edge, as :func:`border_residuals` gives them.
 
     Attributes:
-        right: Whether the sample belongs to the right line.
-        ahead_cm: Distance ahead of the front axle.
-        residual_px: Distance across the border to the edge, positive towards the marking's middle, in pixels
-            of the image; NaN if no edge of this direction lies within the gate.
+        left: Of the left lines.
+        right: Of the right lines.
+        chance: Of left lines that were shifted into the middle of the lane, where no marking is.
     """
 
-    right: Bool[np.ndarray, "m"]
-    ahead_cm: Float[np.ndarray, "m"]
-    residual_px: Float[np.ndarray, "m"]
-
-    @property
-    def found(self) -> Bool[np.ndarray, "m"]:
-        """Whether the sample met an edge."""
-        return np.isfinite(self.residual_px)
-
-    def select(self, rows: Bool[np.ndarray, "m"]) -> BorderSamples:
-        """Return some of the samples."""
-        return BorderSamples(*(column[rows] for column in self))
+    left: Float[np.ndarray, "_"]
+    right: Float[np.ndarray, "_"]
+    chance: Float[np.ndarray, "_"]
 
 
-def join_samples(parts: list[BorderSamples]) -> BorderSamples:
-    """Concatenate the samples of several frames."""
-    none = BorderSamples(np.zeros(0, dtype=bool), np.zeros(0), np.zeros(0))
-    return BorderSamples(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
+def coverage(residual_px: Float[np.ndarray, "m"]) -> float:
+    """Share of the places that met an edge; NaN without places."""
+    return float(np.isfinite(residual_px).mean()) if residual_px.size else float("nan")
 
 
-def border_samples(
+def robust_sd(residual_px: Float[np.ndarray, "m"]) -> float:
+    """1.4826 times the median of the absolute residuals, a common offset included; NaN without any."""
+    size = np.abs(residual_px[np.isfinite(residual_px)])
+    return 1.4826 * float(np.median(size)) if size.size else float("nan")
+
+
+def held_out_residuals(mapped: MappedDrive) -> Residuals:
+    """Compare a map's lines with its held-out frames, without what is withheld of the lines."""
+    drive_map, parts = mapped.drive_map, [Residuals(*[np.zeros(0)] * 3)]
+    tape_cm, aside_cm = drive_map.meta.tape_cm, 0.5 * drive_map.meta.mapped_lane_cm
+    for k, edges, keep in frame_edges(mapped, np.flatnonzero(drive_map.held_out)):
+        lines = lines_at(drive_map, k).without(drive_map.errors.doubted[k])
+        seen = edges, lines, tape_cm, drive_map.camera_at(k), keep
+        parts.append(Residuals(*border_residuals(*seen), border_residuals(*seen, aside_cm)[0]))
+    return Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def border_residuals(
     edges: EdgePixels,
     lines: FrameLines,
     tape_cm: float,
     camera: Camera,
     keep: UInt8[np.ndarray, "h w"],
     aside_cm: float = 0.0,
-) -> BorderSamples:
+) -> tuple[Float[np.ndarray, "l"], Float[np.ndarray, "r"]]:
     """Measure the distance of a frame's edges from the borders that its lines predict.
 
     Args:
@@ -100,57 +94,42 @@ def border_samples(
         camera: Camera with the tilt of the frame.
         keep: Nonzero where the image shows road.
         aside_cm: Shift both lines to the right by this, off their markings.
+
+    Returns:
+        Of each place in view on the borders of the left, the right line: distance across the border to the
+        edge, positive towards the marking's middle, in pixels of an image 160 px wide; NaN if no edge of this
+        direction lies within the gate.
     """
-    parts = []
-    for i, line in enumerate((lines.left_cm, lines.right_cm)):
-        at, across, marking_cm = _along(line, lines.markings_cm(i, tape_cm))
-        at = at + aside_cm * across
-        for border in (-0.5, 0.5):
-            # ``across`` points to the right; the left border lies on its negative side.
-            place = at + border * marking_cm[:, None] * across
-            uv, gradient = _in_image(place, -np.sign(border) * across, camera)
-            seen = in_view(uv, gradient, keep)
-            gate_px = GATE_PX / reference_scale(camera)
-            residual = _nearest(edges.uv_px, edges.normals, uv[seen], gradient[seen], gate_px)
-            parts.append(BorderSamples(np.full(int(seen.sum()), SIDES[i] == "right"), at[seen, 1], residual))
-    return join_samples(parts)
+    scale, found = reference_scale(camera), []
+    for side, line in enumerate((lines.left_cm, lines.right_cm)):
+        step = np.diff(line, axis=0)
+        step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+        right = np.stack([step[:, 1], -step[:, 0]], axis=1)
+        middle = 0.5 * (line[1:] + line[:-1]) + aside_cm * right
+        near = (middle[:, 1] >= 0.0) & (middle[:, 1] < REACH_CM)
+        parts = []
+        # The left border brightens to the right, the right one to the left; in the image as on the road.
+        for sign in (1.0, -1.0):
+            place = middle - 0.5 * sign * lines.markings_cm(side, tape_cm)[1:, None] * right
+            uv = camera.project_ground(place)
+            along = camera.project_ground(place + 0.1 * step) - uv
+            along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+            gradient = sign * np.stack([-along[:, 1], along[:, 0]], axis=1)
+            seen = near & in_view(uv, gradient, keep)
+            met = _nearest(edges.uv_px, edges.normals, uv[seen], gradient[seen], _GATE_PX / scale)
+            parts.append(scale * met)
+        found.append(np.concatenate(parts))
+    return found[0], found[1]
 
 
-def _along(
-    line_cm: Float[np.ndarray, "k 2"], widths_cm: Float[np.ndarray, "k"]
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
-    """Sample a polyline evenly within the bands; return points, unit vectors to its right, and widths."""
-    step = np.diff(line_cm, axis=0)
-    length = np.linalg.norm(step, axis=1)
-    good = np.isfinite(length) & (length > 1e-9)
-    start, length = line_cm[:-1][good], length[good]
-    ahead = step[good] / length[:, None]
-    # The spacing continues from one segment to the next, so that short segments get their share of samples.
-    ends = np.cumsum(length)
-    s = np.arange(0.0, length.sum(), _STEP_CM)
-    k = np.minimum(np.searchsorted(ends, s, side="right"), len(ends) - 1)
-    past = s - (ends - length)[k]
-    at = start[k] + past[:, None] * ahead[k]
-    width, change = widths_cm[:-1][good], np.diff(widths_cm)[good] / length
-    right = np.stack([ahead[k, 1], -ahead[k, 0]], axis=1)
-    inside = (at[:, 1] >= BANDS_CM[0]) & (at[:, 1] < BANDS_CM[-1])
-    return at[inside], right[inside], (width[k] + past * change[k])[inside]
-
-
-def _in_image(
-    place_cm: Float[np.ndarray, "m 2"], towards: Float[np.ndarray, "m 2"], camera: Camera
-) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
-    """Project a border and its unit normal, which points into the marking, into the image."""
-    along = np.stack([-towards[:, 1], towards[:, 0]], axis=1)
-    uv, ahead, inwards = (
-        camera.project_ground(points)
-        for points in (place_cm, place_cm + 0.1 * along, place_cm + 0.1 * towards)
-    )
-    tangent = ahead - uv
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    normal *= np.where(np.sum(normal * (inwards - uv), axis=1) < 0.0, -1.0, 1.0)[:, None]
-    return uv, normal
+def reference_scale(camera: Camera) -> float:
+    """Reference pixels per pixel of the image: those of an image 160 px wide that shows the road as usual."""
+    m = camera.mounting
+    # A place that it sees, wherever it is.
+    ahead_cm = max(REACH_CM, m.ahead_of_front_axle_cm + m.height_cm)
+    left, right = camera.project_ground(np.array([[-0.5, ahead_cm], [0.5, ahead_cm]]))
+    px_per_cm = float(np.hypot(*(right - left)))
+    return min(_REFERENCE_WIDTH / camera.width, 1.0 / (_FINEST_CM * px_per_cm))
 
 
 def in_view(
@@ -159,8 +138,7 @@ def in_view(
     """Return which points lie in the image where it shows road; those with NaN in either argument do not."""
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(gradient).all(axis=1)
     nearest = np.rint(np.where(finite[:, None], uv, -1.0)).clip(-1, 1e6).astype(np.intp)
-    height, width = keep.shape
-    inside = finite & (nearest >= 0).all(axis=1) & (nearest[:, 0] < width) & (nearest[:, 1] < height)
+    inside = np.asarray(((nearest >= 0) & (nearest < keep.shape[::-1])).all(axis=1))
     inside[inside] = keep[nearest[inside, 1], nearest[inside, 0]] > 0
     return inside
 
@@ -179,53 +157,9 @@ def _nearest(edge_uv, edge_normal, uv, gradient, gate_px):
             # Edge pixels of a line are about one pixel apart, at any image size.
             if abs(across) > best or abs(dx * gy - dy * gx) > 0.75:
                 continue
-            if edge_normal[j, 0] * gx + edge_normal[j, 1] * gy >= _MIN_AGREEMENT:
+            if edge_normal[j, 0] * gx + edge_normal[j, 1] * gy >= COSINE:
                 found[i], best = across, abs(across)
     return found
-
-
-@dataclass(frozen=True)
-class ResidualFigures:
-    """Summary of some residuals.
-
-    Attributes:
-        samples: Number of places in view.
-        coverage: Share of them that met an edge.
-        robust_sd_px: 1.4826 times the median of the absolute residuals; includes a common offset.
-        p95_px: 95th percentile of the absolute residuals.
-        median_px: Median residual, positive towards the markings' middle.
-    """
-
-    samples: int
-    coverage: float
-    robust_sd_px: float
-    p95_px: float
-    median_px: float
-
-    def as_dict(self, scale: float) -> dict[str, float | int]:
-        """Return the figures in pixels of the image and in reference pixels, see :func:`reference_scale`."""
-        return {
-            **vars(self),
-            **{
-                f"{name}_at_160": vars(self)[name] * scale for name in ("robust_sd_px", "p95_px", "median_px")
-            },
-        }
-
-
-def summarise(samples: BorderSamples) -> ResidualFigures:
-    """Summarise samples; NaN where there are none."""
-    found = samples.residual_px[samples.found]
-    if not found.size:
-        share = 0.0 if len(samples.residual_px) else float("nan")
-        return ResidualFigures(len(samples.residual_px), share, *([float("nan")] * 3))
-    size = np.abs(found)
-    return ResidualFigures(
-        len(samples.residual_px),
-        found.size / len(samples.residual_px),
-        1.4826 * float(np.median(size)),
-        float(np.percentile(size, 95.0)),
-        float(np.median(found)),
-    )
 
 
 def frame_edges(

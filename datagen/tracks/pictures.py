@@ -13,6 +13,7 @@ from datagen.assemble import AssembledMap
 from datagen.quality.pictures import draw_metre, write_png
 from datagen.tracks.relaid import RelaidPlace
 from lanenet.data.maps.folder import DriveMap
+from lanenet.perception.draw import draw_polyline
 
 #: Colours of the drives' edges and paths, in turn, of the lines, and of places laid anew, BGR. Chosen: told
 #: apart by people who see no red or no green.
@@ -42,25 +43,22 @@ def draw_joined(
 
     def pixels(points: Float[np.ndarray, "m 2"]) -> np.ndarray:
         at = (points - low) * scale
-        return np.stack([at[:, 0], height - 1 - at[:, 1]], axis=1).astype(np.int32)
+        return np.stack([at[:, 0], height - 1 - at[:, 1]], axis=1)
 
     for number, cloud in enumerate(clouds):
-        at = pixels(cloud)
+        at = pixels(cloud).astype(np.int32)
         image[at[:, 1], at[:, 0]] = 0.55 * np.array(_DRIVES[number % len(_DRIVES)])
     for number, (name, _, drive_map) in enumerate(members):
         colour = _DRIVES[number % len(_DRIVES)]
-        cv2.polylines(image, [pixels(drive_map.poses[:, :2])], False, colour, 1, cv2.LINE_AA)
+        draw_polyline(image, pixels(drive_map.poses[:, :2]), colour, 1)
         cv2.putText(
             image, name, (20, 34 + 30 * number), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA
         )
     for line in lines:
-        known = np.isfinite(line[:, 0])
-        for run in np.split(np.arange(len(line)), np.flatnonzero(np.diff(known)) + 1):
-            if known[run[0]]:
-                cv2.polylines(image, [pixels(line[run])], False, _LINE, 2, cv2.LINE_AA)
+        draw_polyline(image, pixels(line), _LINE, 2)
     for place in places:
-        cv2.polylines(image, [pixels(place.points_cm)], False, _RELAID, 4, cv2.LINE_AA)
-        x, y = pixels(np.array([place.at_cm]))[0].tolist()
+        draw_polyline(image, pixels(place.points_cm), _RELAID, 4)
+        x, y = pixels(np.array([place.at_cm]))[0].astype(np.int32).tolist()
         text = "gone" if place.apart_cm is None else f"{place.apart_cm:.1f} cm"
         cv2.putText(image, text, (x + 12, y), cv2.FONT_HERSHEY_SIMPLEX, 0.8, _RELAID, 2, cv2.LINE_AA)
     draw_metre(image, scale)

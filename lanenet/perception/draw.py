@@ -79,7 +79,7 @@ def _draw_road(
     y_cm = np.linspace(0.0, FAR_CM, _SAMPLES)
     for side, colour in enumerate(colours):
         x_cm = np.polyval(estimate.parabolas[side], y_cm)
-        _draw_polyline(image, _pixels(np.stack([x_cm, y_cm], axis=1), camera, scale), colour, thickness)
+        draw_polyline(image, _pixels(np.stack([x_cm, y_cm], axis=1), camera, scale), colour, thickness)
     rows_cm = np.tile(ROWS_CM, len(SIDES))
     points = _pixels(np.stack([estimate.points_cm, rows_cm], axis=1), camera, scale)
     for index, point in enumerate(points):
@@ -97,10 +97,10 @@ def _draw_image_lane(image: UInt8[np.ndarray, "h w 3"], lane: ImageLane, scale: 
     if lane.filled and lane.left_px is not None and lane.right_px is not None:
         _fill_between(image, enlarged(lane.left_px), enlarged(lane.right_px))
     for line_px in lane.memory_px:
-        _draw_polyline(image, enlarged(line_px), MEMORY_BGR, max(1, thickness // 2))
+        draw_polyline(image, enlarged(line_px), MEMORY_BGR, max(1, thickness // 2))
     for side_px, colour in ((lane.left_px, LEFT_BGR), (lane.right_px, RIGHT_BGR)):
         if side_px is not None:
-            _draw_polyline(image, enlarged(side_px), colour, thickness)
+            draw_polyline(image, enlarged(side_px), colour, thickness)
 
 
 def _fill_between(image: UInt8[np.ndarray, "h w 3"], left_px: Polyline, right_px: Polyline) -> None:
@@ -136,12 +136,13 @@ def _fixed(point_px: Float[np.ndarray, "2"]) -> tuple[int, int]:
     return round(float(point_px[0]) * (1 << _SHIFT)), round(float(point_px[1]) * (1 << _SHIFT))
 
 
-def _draw_polyline(
+def draw_polyline(
     image: UInt8[np.ndarray, "h w 3"],
     points_px: Float[np.ndarray, "n 2"],
     colour: tuple[int, int, int],
     thickness: int,
 ) -> None:
+    """Draw a line in the image, as far as it is inside; points with NaN interrupt it."""
     seen = np.isfinite(points_px).all(axis=1)
     for k in np.flatnonzero(seen[:-1] & seen[1:]):
         # A line is an area of two corners; clipping may repeat its ends.

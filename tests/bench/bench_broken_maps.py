@@ -18,7 +18,6 @@ import numpy as np
 
 from datagen.check import compare_with_frames
 from datagen.quality.figures import map_evidence
-from datagen.quality.measure import label_evidence, quality_figures, withheld_figures
 from datagen.quality.verdict import VerdictSettings, judge
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.mapped_drive import MappedDrive, label_frames, open_mapped_drive
@@ -73,9 +72,7 @@ def check(mapped: MappedDrive, good_cm: np.ndarray, folder: Path) -> tuple[str, 
     """
     figures = json.loads((folder / "report.json").read_text())
     mapped, quality = compare_with_frames(mapped, figures)
-    figures |= quality_figures(quality)
-    figures["withheld"] = withheld_figures(mapped.drive_map, quality)
-    evidence = map_evidence(mapped.drive_map, figures, label_evidence(mapped, quality), None)
+    evidence = map_evidence(mapped.drive_map, figures, quality, None)
     grade = judge(evidence, VerdictSettings()).grade
     off_cm = quality.points_cm - good_cm
     way_cm = path_lengths(mapped.drive_map.poses)

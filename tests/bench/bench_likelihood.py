@@ -134,12 +134,11 @@ def remapped(mapped: MappedDrive, folder: Path, settings: MapSettings, out: Path
         ).figures
     except LanenetError as error:
         return {"refused": str(error)}
-    both = figures["held_out"]["both_lines"]
     return {
         "revisits": sum(segment["revisits"] for segment in figures["segments_mapped"]),
         "closed": all(segment["closed"] for segment in figures["segments_mapped"]),
-        "held_out": both,
-        "labelled_share": round(figures["labelled"]["share"], 3),
+        "held_out": figures["held_out"],
+        "labelled_share": round(figures["labels"]["labelled"] / figures["labels"]["frames"], 3),
         "verdict": figures["verdict"]["grade"],
     }
 

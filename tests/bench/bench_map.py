@@ -112,15 +112,13 @@ def map_and_label(drive: Path, lane_width_cm: float, hertz: float) -> None:
         sys.stdout.write(json.dumps(stage.row()) + "\n")
     figures = report.figures
     duration_s = figures["frames"] / hertz
-    both = figures["held_out"]["both_lines"]
     total = {
         "wall_s": round(wall_s, 1),
         "cpu_s": round(cpu_s() - begun_cpu, 1),
         "drive_s": round(duration_s, 1),
         "ratio": round(wall_s / duration_s, 2),
         "verdict": figures["verdict"]["grade"],
-        "focal_px": round(figures["camera"]["focal_px"], 1),
-        "held_out": {name: round(both[name], 3) for name in ("robust_sd_px", "p95_px")},
+        "held_out": {name: round(value, 3) for name, value in figures["held_out"].items()},
         "labelled_share": round(labels.figures["labelled_share"], 3),
     }
     sys.stdout.write(json.dumps({"drive": drive.name, **total}) + "\n")

@@ -194,9 +194,8 @@ def _read_map(folder: Path) -> Results:
         "map.match": poses["match"][::_EVERY_POSE],
         "map.open_loop_cm": np.loadtxt(folder / "open_loop.tum")[::_EVERY_POSE, 1:3] * 100.0,
         "map.lane and tape_cm": _real(meta["mapped_lane_cm"], meta["tape_cm"]),
-        "map.held-out residual_px": _real(
-            *(report["held_out"]["both_lines"][key] for key in ("robust_sd_px", "p95_px"))
-        ),
+        "map.held-out residual_px": _real(report["held_out"]["robust_sd_px_at_160"]),
+        "map.held-out coverage": _real(report["held_out"]["coverage"]),
         "map.steering": _real(*(segment["steering"][key] for key in ("gain", "correlation"))),
         "map.steering lag": _whole(segment["steering"]["lag_frames"]),
         "camera.focal and centre_px": _real(*(camera["K"][i][j] for i, j in ((0, 0), (0, 2), (1, 2)))),

@@ -54,7 +54,7 @@ TOLERANCES = {
         # 0.0005 / 0.002
         "map.nod_rad": Tolerance(0.0012, 0.005),
         # 0.004
-        "map.held-out residual_px": Tolerance(0.01, 0.01),
+        "map.held-out *": Tolerance(0.01, 0.01),
         "map.steering": Tolerance(0.0001, 0.0001),
         # The frame at which a lap begins: one of 72.
         "map.lap": Tolerance(0.2, 1.0),
@@ -97,7 +97,7 @@ TOLERANCES = {
         # 0.0008 / 0.0043
         "map.nod_rad": Tolerance(0.002, 0.012),
         # 0.017 / 0.02
-        "map.held-out residual_px": Tolerance(0.05, 0.05),
+        "map.held-out *": Tolerance(0.05, 0.05),
         # 0.0003
         "map.steering": Tolerance(0.001, 0.001),
         "map.lap": Tolerance(0.2, 1.0),

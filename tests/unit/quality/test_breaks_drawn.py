@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from datagen.quality import page as page_module
-from datagen.quality import plots
 from datagen.quality.figures import steering_answer
 from datagen.quality.pictures import draw_map
 from datagen.slam.camera.coarse import guessed_camera
@@ -24,7 +21,7 @@ from lanenet.perception.edges.road import PerceptionSettings
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
 #: Frames of the drive; of its four runs the third is not on the map, and the second in one of its own.
-N, BREAKS = 40, [10, 20, 25]
+N, BREAKS = 80, [10, 20, 25]
 ROWS = np.delete(np.arange(N), np.arange(20, 25))
 STARTS = [0, 10, 20]
 
@@ -32,8 +29,8 @@ STARTS = [0, 10, 20]
 @pytest.fixture
 def mapped() -> MappedDrive:
     """The runs start 200 cm apart, on parallel paths, 2 cm per frame."""
-    run = np.repeat([0, 1, 3], [10, 10, 15])
-    since = np.concatenate([np.arange(10), np.arange(10), np.arange(15)])
+    run = np.repeat([0, 1, 3], [10, 10, 55])
+    since = np.concatenate([np.arange(10), np.arange(10), np.arange(55)])
     poses = np.column_stack([2.0 * since, 200.0 * run, 0.0 * since])
     n = len(ROWS)
     drive_map = DriveMap(
@@ -79,31 +76,17 @@ def mapped() -> MappedDrive:
     return MappedDrive(drive_map, drive, ROWS, PerceptionSettings())
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The figures that the plots would write."""
-    pytest.importorskip("matplotlib")
-    figures: list[Any] = []
-
-    def keep(figure: Any) -> bytes:
-        figures.append(figure)
-        return b""
-
-    monkeypatch.setattr(plots, "png_bytes", keep)
-    return figures
-
-
 def test_a_run_starts_at_a_break_and_after_one_that_was_left_out(mapped):
     np.testing.assert_array_equal(np.flatnonzero(mapped.starts), STARTS)
 
 
 def test_the_path_is_not_drawn_across_a_break(tmp_path, mapped):
     clouds = [np.empty((0, 2))] * len(ROWS)
-    draw_map(tmp_path / "map.png", mapped.drive_map, clouds, mapped.starts, size_px=400)
+    draw_map(tmp_path / "map.png", mapped.drive_map, clouds, mapped.starts)
     image = cv2.imread(str(tmp_path / "map.png"))
     # Left of the metre of scale in the corner there is nothing else that is white.
-    white = (image > 200).all(axis=2)[: image.shape[0] - 60]
-    scale = 400 / 640.0
+    white = (image > 200).all(axis=2)[: image.shape[0] - 80]
+    scale = 1600 / 640.0
     rows = np.flatnonzero(white.any(axis=1))
     expected = image.shape[0] - 1 - scale * (20.0 + np.array([200.0, 600.0]))
     assert np.min(np.abs(rows[:, None] - expected), axis=1).max() <= 2.0
@@ -115,28 +98,8 @@ def test_the_path_is_not_drawn_across_a_break(tmp_path, mapped):
     assert first.min() > second.max()
 
 
-def test_the_trajectory_is_interrupted_at_breaks(mapped, drawn):
-    plots.trajectory_plot(mapped, mapped.drive_map.poses)
-    (axes,) = drawn[0].axes
-    for line in axes.lines[:2]:
-        x, y = (np.asarray(values, dtype=float) for values in line.get_data())
-        assert len(x) == len(ROWS) + 2
-        np.testing.assert_array_equal(np.flatnonzero(np.isnan(y)), [10, 21])
-        assert np.nanmax(np.abs(np.diff(y))) == 0.0
-
-
-def test_steps_and_curvature_across_a_break_are_left_out(mapped, drawn):
-    plots.speed_plot(mapped)
-    step = np.asarray(drawn[0].axes[0].lines[0].get_ydata(), dtype=float)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(step)) + 1, STARTS[1:])
-    np.testing.assert_allclose(step[np.isfinite(step)], 2.0)
-    plots.steering_plot(mapped, 0)
-    # Of the first segment's 25 frames, two begin a run.
-    assert len(drawn[1].axes[0].lines[0].get_ydata()) == 23
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0, None])
-def test_steering_that_turns_the_car_the_other_way_is_noticed(mapped, drawn, sign):
+def test_steering_that_turns_the_car_the_other_way_is_noticed(mapped, sign):
     """The car turns as it is steered, the other way round, or for reasons of its own; two frames later."""
     n = len(ROWS)
     steered = mapped.drive.commands.angle[np.maximum(ROWS - 2, 0)]
@@ -147,15 +110,6 @@ def test_steering_that_turns_the_car_the_other_way_is_noticed(mapped, drawn, sig
     poses[:, 2] = heading
     turned = replace(mapped, drive_map=replace(mapped.drive_map, poses=poses))
     found = steering_answer(turned)
-    text = page_module._commands(turned)[0]
-    if sign is None:
-        assert found is None
-        assert "does not explain the path" in text
-    else:
-        assert abs(found.correlation - sign) < 0.05
-        assert found.delay_frames == 2
-        # What the section says is what the verdict says.
-        assert "does not explain the path" not in text
-        assert ("turns the other way" in text) == (sign < 0.0)
+    assert found is None if sign is None else abs(found - sign) < 0.05
     blind = replace(mapped, drive=replace(mapped.drive, commands=Commands()))
     assert steering_answer(blind) is None

@@ -16,8 +16,7 @@ from small_map import CAMERA, small_map
 from datagen.lanes.offset import CubicBasis
 from datagen.quality import evidence
 from datagen.quality.label_error import KINDS, doubted_by, predict_errors
-from datagen.quality.measure import LABELLED, MapQuality, label_evidence, wrong_sections
-from datagen.quality.residuals import join_samples
+from datagen.quality.measure import LABELLED, label_evidence, wrong_sections
 from lanenet.data.drives.recording import Commands, Drive, ImageFiles
 from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.line import LaneLine, Side
@@ -151,7 +150,7 @@ def test_labels_on_their_tape_are_not_doubted(monkeypatch, tapes):
     """Nor in the gaps of a dashed line, and another tape that lies beside it everywhere is no rival."""
     mapped = drawn(monkeypatch, *tapes)
     features, errors = judged(mapped)
-    assert errors.off_1.max() < 0.05 and wrong_sections(mapped.drive_map, features, errors) == ([], 0.0)
+    assert errors.off_1.max() < 0.05 and wrong_sections(mapped.drive_map, features, errors) == ((), 0.0)
     met = feature(features, "others_met")
     assert met[:, 3:].min() > 0.95 and np.nanmax(feature(features, "own_rival")) < 0.5
     if tapes[0][1] is dashes:
@@ -177,7 +176,7 @@ def test_labels_of_a_pass_whose_poses_are_off_are_doubted_and_the_lines_are_not_
     mapped = drawn(monkeypatch, LEFT, RIGHT, moved_cm=np.where(moved, 4.0, 0.0))
     features, errors = judged(mapped)
     assert errors.withheld[202:248].mean() > 0.9 and not errors.withheld[(k < 198) | (k >= 252)].any()
-    assert wrong_sections(mapped.drive_map, features, errors)[0] == []
+    assert wrong_sections(mapped.drive_map, features, errors)[0] == ()
 
 
 def test_a_pass_is_compared_with_the_others_also_where_it_crosses_the_seam(monkeypatch):
@@ -264,8 +263,8 @@ def test_a_section_of_which_most_labels_are_off_is_wrong_also_across_the_seam(mo
 
 def test_what_one_lap_sees_or_is_short_is_no_section_and_the_longest_comes_first(monkeypatch):
     mapped = drawn(monkeypatch, LEFT, RIGHT)
-    assert sections(mapped, 0, [(100.0, 160.0)], PER_LAP) == ([], 0.0)
-    assert sections(mapped, 0, [(100.0, 105.0)])[0] == []
+    assert sections(mapped, 0, [(100.0, 160.0)], PER_LAP) == ((), 0.0)
+    assert sections(mapped, 0, [(100.0, 105.0)])[0] == ()
     found, share = sections(mapped, 1, [(100.0, 130.0), (300.0, 380.0)])
     assert [one.section_cm[0] > 250.0 for one in found] == [True, False] and share > 0.08
     (whole,), share = sections(mapped, 1, [(0.0, LAP_CM)])
@@ -292,15 +291,15 @@ def test_what_a_set_holds(monkeypatch, turn):
     poses[n // 2 + 2 :, 0] += 1000.0
     errors = LabelErrors(*(np.where(np.isfinite(points_cm), p, 1.0) for p in (0.1, 0.04, 0.002)))
     mapped = replace(mapped, drive_map=replace(mapped.drive_map, poses=poses, errors=errors))
-    in_window = np.zeros(points_cm.shape, dtype=bool)
-    quality = MapQuality(np.zeros(0, int), [], join_samples([]), status, points_cm, in_window, in_view=0.7)
-    held = label_evidence(mapped, quality)
+    held = label_evidence(mapped.drive_map, status, points_cm, {})
     assert (held.labelled, held.frames, held.not_labelled) == (n // 3, 2 * n // 3, {DOUBTFUL: n // 3})
-    assert (held.off_1, held.off_3, held.in_view) == pytest.approx((0.04, 0.002, 0.7))
+    assert (held.off_1, held.off_3) == pytest.approx((0.04, 0.002))
+    places = np.column_stack([points_cm[2], np.tile(ROWS_CM, 2)])[[0, 1, 3, 4, 5]]
+    assert held.in_view == pytest.approx(CAMERA.shows_ground(places).mean())
     assert held.outside_share == pytest.approx(1.0 / (2 * n // 3 + 1))
     # A third of two laps.
     assert held.metres == pytest.approx(4.0, abs=0.15)
     bends = (held.left_m, held.right_m)[:: 1 if turn >= 0.0 else -1]
     assert bends == pytest.approx((4.0, 0.0) if turn else (0.0, 0.0), abs=0.3)
-    nothing = replace(quality, points_cm=np.full(points_cm.shape, np.nan))
-    assert np.isnan(label_evidence(mapped, nothing).off_3) and label_evidence(mapped, nothing).metres == 0.0
+    nothing = label_evidence(mapped.drive_map, status, np.full(points_cm.shape, np.nan), {})
+    assert np.isnan(nothing.off_3) and nothing.metres == 0.0

@@ -14,8 +14,7 @@ from datagen.calibrate_drive import calibrate_drive
 from datagen.check import check_lines_seen
 from datagen.pipeline import MapRequest, map_drive
 from datagen.prepare import check_edges, check_moving
-from datagen.quality.measure import MapQuality
-from datagen.quality.residuals import BorderSamples, join_samples
+from datagen.quality.residuals import Residuals
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
@@ -209,45 +208,40 @@ def test_one_line_beside_which_a_streak_or_bare_floor_is_traced(tmp_path, seed, 
     assert "one line only" in refusal(drive, tmp_path / "map")
 
 
-def border(right: bool, met: float, spread_px: float, seed: int) -> BorderSamples:
-    """Places on a line, of which a share met edges this far off."""
+def border(met: float, spread_px: float, seed: int) -> np.ndarray:
+    """Residuals at places on a line, of which a share met edges this far off."""
     rng, n = np.random.default_rng(seed), 2000
-    off = np.where(rng.random(n) < met, rng.uniform(-spread_px, spread_px, n), np.nan)
-    return BorderSamples(np.full(n, right), rng.uniform(0.0, 45.0, n), off)
+    return np.where(rng.random(n) < met, rng.uniform(-spread_px, spread_px, n), np.nan)
 
 
-def shown(*lines: BorderSamples, chance: BorderSamples | None = None) -> MapQuality:
-    none, every = np.empty((0, 6)), join_samples(list(lines))
-    aside = join_samples([] if chance is None else [chance])
-    return MapQuality(np.arange(1), [every], aside, [], none, none.astype(bool))
+GOOD, NONE = border(0.97, 0.3, 0), np.full(10, np.nan)
 
 
 def test_a_line_that_meets_edges_by_chance_is_none(both_lines):
     drive = open_drive(both_lines)
-    left, right = (border(right, 0.97, 0.3, 0) for right in (False, True))
-    check_lines_seen(shown(left, right), drive, 40.0, None)
+    check_lines_seen(Residuals(GOOD, GOOD, NONE), drive, 40.0, None)
     # A worn line is found along little of its length, but where it is.
-    check_lines_seen(shown(border(False, 0.1, 1.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
+    worn = border(0.1, 1.0, 1)
+    check_lines_seen(Residuals(worn, GOOD, NONE), drive, 40.0, None)
     # But not where the middle of the lane, on a mottled floor, meets as many.
     with pytest.raises(TrackingLostError, match=r"one line only .*of the left line"):
-        worn = border(False, 0.1, 1.0, 1)
-        check_lines_seen(shown(worn, right, chance=border(False, 0.08, 3.0, 2)), drive, 40.0, None)
+        check_lines_seen(Residuals(worn, GOOD, border(0.08, 3.0, 2)), drive, 40.0, None)
     # A map that is bent is looked at, and rejected.
-    check_lines_seen(shown(border(False, 0.9, 4.0, 1), border(True, 0.97, 0.3, 0)), drive, 40.0, None)
+    check_lines_seen(Residuals(border(0.9, 4.0, 1), GOOD, NONE), drive, 40.0, None)
+    met_by_chance = border(0.25, 4.0, 1)
     with pytest.raises(
         TrackingLostError, match=r"one line only .* 2\d % of the left line.* 2\.\d px.*of the left line"
     ):
-        check_lines_seen(shown(border(False, 0.25, 4.0, 1), right), drive, 40.0, None)
+        check_lines_seen(Residuals(met_by_chance, GOOD, NONE), drive, 40.0, None)
     with pytest.raises(TrackingLostError, match=r"no lane: .*of the left and the right line"):
-        check_lines_seen(shown(border(False, 0.25, 4.0, 1), border(True, 0.3, 4.0, 2)), drive, 40.0, None)
+        check_lines_seen(Residuals(met_by_chance, border(0.3, 4.0, 2), NONE), drive, 40.0, None)
     with pytest.raises(TrackingLostError, match=r"no lane: .*along 1. %"):
-        check_lines_seen(shown(border(False, 0.15, 4.0, 1), border(True, 0.15, 4.0, 2)), drive, 40.0, None)
+        check_lines_seen(Residuals(border(0.15, 4.0, 1), border(0.15, 4.0, 2), NONE), drive, 40.0, None)
 
 
 def test_a_line_that_meets_edges_by_chance_where_a_lane_of_another_width_is(both_lines):
-    lines = shown(border(False, 0.25, 4.0, 1), border(True, 0.97, 0.3, 0))
     with pytest.raises(CalibrationError, match=r"no two lines 20 cm apart .* 40 cm apart"):
-        check_lines_seen(lines, open_drive(both_lines), 20.0, 40.2)
+        check_lines_seen(Residuals(border(0.25, 4.0, 1), GOOD, NONE), open_drive(both_lines), 20.0, 40.2)
 
 
 def test_no_line_at_all(tmp_path):
