@@ -437,8 +437,7 @@ class _DenseSegment:
         pairs = propose_revisits(thumbnails(self.view.drive), opened.poses, periods, self.height, s)
         matcher, rng = self.place_matcher(opened), self.solver.rng
         turned = propose_turned(opened.poses, self.part, self.height, s)
-        facing = [matcher.match((earlier, later), rng, at) for earlier, later, at in turned]
-        return matcher.matched(pairs, rng) + [r for r in facing if r is not None]
+        return matcher.matched(pairs, rng) + matcher.turned(turned, rng)
 
     def place_matcher(self, opened: BundleResult) -> PlaceMatcher:
         """Aligns visits of a place by the edges that the open loop maps around each."""
@@ -499,7 +498,7 @@ class _DenseSegment:
         tried = set(alike)
         for _ in range(_MOST_SPREAD):
             pairs = [p for p in propose_beside(poses, periods, confirmed, self.height, s) if p not in tried]
-            found = matcher.matched(pairs, rng)
+            found = matcher.matched(pairs, rng, poses)
             tried.update(pairs)
             if not found:
                 break

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
-from datagen.slam.loops.revisits import Revisit, RevisitSettings
+from datagen.slam.loops.revisits import Revisit, RevisitSettings, facing
 from lanenet.geometry.frames import wrap_angle
 from lanenet.geometry.poses import compose, path_lengths, relative_pose
 
@@ -130,11 +130,16 @@ def loop_pairs(revisits: list[Revisit], part: Int[np.ndarray, "n"]) -> list[tupl
         part: Part of the drive that each frame belongs to.
     """
     count = len(part)
-    pairs = [(r, r.earlier + d, r.later + d) for r in revisits for d in _AROUND_REVISIT]
+    # Of two cars that face each other, one comes where the other came from.
+    pairs = [
+        (r, r.earlier + d, r.later - d if abs(r.relative[2]) > 0.5 * np.pi else r.later + d)
+        for r in revisits
+        for d in _AROUND_REVISIT
+    ]
     return [
         (a, b)
         for r, a, b in pairs
-        if a >= 0 and b < count and part[a] == part[r.earlier] and part[b] == part[r.later]
+        if min(a, b) >= 0 and max(a, b) < count and part[a] == part[r.earlier] and part[b] == part[r.later]
     ]
 
 
@@ -165,6 +170,12 @@ def neighbouring_laps(
             passing = near[path[near] > path[near[-1]] - _PASSING_HEIGHTS * camera_height_cm]
             visit = int(passing[np.argmin(apart[passing])])
             pairs.append((visit, later))
+        place = facing(poses[later], camera_height_cm)
+        apart = relative_pose(np.broadcast_to(place, (later, 3)), poses[:later])
+        near = np.hypot(apart[:, 0], apart[:, 1]) < _LAP_HEIGHTS * camera_height_cm
+        near &= path[:later] <= path[later] - settings.min_gap_heights * camera_height_cm
+        opposite = np.flatnonzero(near & (np.abs(apart[:, 2]) < _LAP_RAD))
+        pairs += [(int(opposite[np.hypot(*apart[opposite, :2].T).argmin()]), later)] if opposite.size else []
     return pairs
 
 

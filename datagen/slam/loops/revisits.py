@@ -24,7 +24,7 @@ from lanenet.config import Settings
 from lanenet.data.drives import Drive
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car, map_from_car_directions, wrap_angle
-from lanenet.geometry.poses import path_lengths, relative_pose
+from lanenet.geometry.poses import compose, path_lengths, relative_pose
 from lanenet.processes import in_threads
 
 #: Blur, in pixels of a small image, that is taken off for contrast, and the least length of what is left,
@@ -246,7 +246,8 @@ def propose_beside(
 
     Images of one place need not be similar: the car may look another way, or light and people have changed.
     Where no known revisit holds a section, a frame in every so much path from the next one is paired with the
-    nearest one of another visit. Further on, the open loop may have drifted away from its true place.
+    nearest one of another visit, and with the one that faces it. Further on, the open loop may have drifted
+    away from its true place.
 
     Args:
         poses: Poses after closing loops.
@@ -266,17 +267,23 @@ def propose_beside(
     for frame in cells.tolist():
         if not spacing_cm <= np.abs(held_cm - path[frame]).min() < _WITHIN_REACH * spacing_cm:
             continue
-        off = relative_pose(np.broadcast_to(poses[frame], poses.shape), poses)
         other = (np.abs(path - path[frame]) > settings.min_gap_heights * camera_height_cm) | (
             recording != recording[frame]
         )
-        near = other & (np.abs(off[:, :2]) < reach).all(axis=1)
-        near &= np.abs(wrap_angle(off[:, 2])) < settings.search_rad
-        if near.any():
-            apart = np.where(near, np.sum((off[:, :2] / reach) ** 2, axis=1), np.inf)
-            partner = int(np.argmin(apart))
-            pairs.append((min(frame, partner), max(frame, partner)))
+        for place in (poses[frame], facing(poses[frame], camera_height_cm)):
+            off = relative_pose(np.broadcast_to(place, poses.shape), poses)
+            near = other & (np.abs(off[:, :2]) < reach).all(axis=1)
+            near &= np.abs(wrap_angle(off[:, 2])) < settings.search_rad
+            if near.any():
+                apart = np.where(near, np.sum((off[:, :2] / reach) ** 2, axis=1), np.inf)
+                partner = int(np.argmin(apart))
+                pairs.append((min(frame, partner), max(frame, partner)))
     return sorted(set(pairs))
+
+
+def facing(pose: Float[np.ndarray, "3"], camera_height_cm: float) -> Float[np.ndarray, "3"]:
+    """Return the pose from which a car sees the same road from the other side."""
+    return compose(pose, np.array([_FACING_HEIGHTS * camera_height_cm, 0.0, np.pi]))
 
 
 def propose_turned(
@@ -355,23 +362,50 @@ class PlaceMatcher:
         self.scans, self.poses, self.part, self.settings = scans, poses, part, settings
         self.height_cm, self.wheelbase_cm = camera.mounting.height_cm, camera.wheelbase_cm
 
-    def matched(self, pairs: Iterable[tuple[int, int]], rng: np.random.Generator) -> list[Revisit]:
-        """Align all pairs; those of which too few edges match are left out."""
-        found = (self.match(pair, rng) for pair in pairs)
+    def matched(
+        self,
+        pairs: Iterable[tuple[int, int]],
+        rng: np.random.Generator,
+        closed: Float[np.ndarray, "n 3"] | None = None,
+    ) -> list[Revisit]:
+        """Align all pairs; those of which too few edges match are left out.
+
+        Args:
+            pairs: The pairs.
+            rng: Draws edge points and samples.
+            closed: Poses by which frames that face each other are found; None where none do.
+        """
+        found = []
+        for earlier, later in pairs:
+            about = np.zeros(3) if closed is None else relative_pose(closed[earlier], closed[later])
+            about = about if abs(about[2]) > 0.5 * np.pi else np.zeros(3)
+            found.append(self.match((earlier, later), rng, about))
+        return [revisit for revisit in found if revisit is not None]
+
+    def turned(
+        self, proposed: Sequence[tuple[int, int, Float[np.ndarray, "3"]]], rng: np.random.Generator
+    ) -> list[Revisit]:
+        """Align the pairs of :func:`propose_turned`."""
+        found = (self.match((a, b), rng, at, _CARRIED_HEIGHTS, _TURNED_FRAMES) for a, b, at in proposed)
         return [revisit for revisit in found if revisit is not None]
 
     def match(
         self,
         pair: tuple[int, int],
         rng: np.random.Generator,
-        turned: Float[np.ndarray, "3"] | None = None,
+        about: Float[np.ndarray, "3"] | None = None,
+        along_heights: float | None = None,
+        frames: int = _MAP_FRAMES,
     ) -> Revisit | None:
         """Align two visits: a search over a grid on a coarse field, then two rounds of samples on finer ones.
 
         Args:
             pair: The earlier and the later frame.
             rng: Draws edge points and samples.
-            turned: Where the later frame is sought if they face each other, see :func:`propose_turned`.
+            about: Where the later frame is sought, in the rear-axle frame of the earlier; None for its place.
+            along_heights: Largest offset along the road; None for that of the settings. Where it is large,
+                a road that looks alike all along gives none.
+            frames: Frames to either side that make the map of the earlier visit.
 
         Returns:
             The revisit, or None where too few edges match.
@@ -381,16 +415,14 @@ class PlaceMatcher:
         query = self._submap(self._around(later, _QUERY_FRAMES), later, rng)
         if len(query.weights) < _LEAST_POINTS:
             return None
-        about = np.zeros(3) if turned is None else turned
-        near = self._around(earlier, _MAP_FRAMES if turned is None else _TURNED_FRAMES)
-        step = _GRID_HEIGHTS * height_cm
-        along_heights = s.along_heights if turned is None else _CARRIED_HEIGHTS
-        reach = np.array([along_heights, s.sideways_heights]) * height_cm
+        about = np.zeros(3) if about is None else about
+        near, step = self._around(earlier, frames), _GRID_HEIGHTS * height_cm
+        reach = np.array([along_heights or s.along_heights, s.sideways_heights]) * height_cm
         along, sideways = (np.arange(-r, r + 1e-9, step) for r in reach)
         angles = np.arange(-s.search_rad, s.search_rad + 1e-9, np.deg2rad(_GRID_DEG))
         tried = about + np.stack(np.meshgrid(along, sideways, angles, indexing="ij"), axis=-1).reshape(-1, 3)
         spread = np.array([step, step, np.deg2rad(_SAMPLE_DEG)])
-        best, share = np.zeros(3), 0.0
+        best, share = about, 0.0
         for cell_heights in _CELLS_HEIGHTS:
             field = DirectionField.empty(cell_heights * height_cm, _FIELD_SIZE)
             for k in near:
@@ -406,7 +438,7 @@ class PlaceMatcher:
                 few = Scan(*(column[::_EVERY_POINT] for column in query))
                 rough = self._shares(field, tried, few) - prior
                 off_cm = np.abs(tried[:, 0] - tried[int(rough.argmax()), 0])
-                if turned is not None and rough[off_cm > height_cm].max() > _AS_WELL * rough.max():
+                if along_heights and rough[off_cm > height_cm].max() > _AS_WELL * rough.max():
                     return None
                 kept = np.argpartition(-rough, _BEST_POSES)[:_BEST_POSES]
                 tried, prior = tried[kept], prior[kept]

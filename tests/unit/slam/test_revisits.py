@@ -9,6 +9,8 @@ from picture_road import made_up_drive
 from tape_road import HEIGHT_CM, WHEELBASE_CM, TapeRoad, tape_road
 
 from datagen.slam.camera.coarse import guessed_camera
+from datagen.slam.commands import BREAK_PERIODS
+from datagen.slam.loops.pose_graph import loop_pairs, neighbouring_laps
 from datagen.slam.loops.revisits import (
     DirectionField,
     PlaceMatcher,
@@ -246,8 +248,7 @@ def test_a_car_that_was_turned_round_finds_its_way_back(carried):
     scans, true, apart, part = _there_and_back(tape_road(220), carried)
     matcher, rng = _matcher(scans, apart, part), np.random.default_rng(0)
     proposed = propose_turned(apart, part, HEIGHT_CM, RevisitSettings())
-    found = [matcher.match((earlier, later), rng, at) for earlier, later, at in proposed]
-    known = [r for r in found if r is not None]
+    known = matcher.turned(proposed, rng)
     assert len(proposed) >= 8
     off = np.array([r.relative - relative_pose(true[r.earlier], true[r.later]) for r in known])
     right = (np.abs(off[:, :2]) < 0.1 * HEIGHT_CM).all(axis=1)
@@ -262,10 +263,23 @@ def test_a_turn_on_a_straight_or_of_a_short_part_finds_nothing():
     assert propose_turned(apart[:260], part[:260], HEIGHT_CM, RevisitSettings()) == []
     # Without the ends of its dashes the tape is alike all along.
     scans.weights[np.abs(scans.normals[:, 1]) > 0.5] = 0.0
-    assert all(
-        matcher.match((earlier, later), rng, at) is None
-        for earlier, later, at in propose_turned(apart, part, HEIGHT_CM, RevisitSettings())
-    )
+    assert matcher.turned(propose_turned(apart, part, HEIGHT_CM, RevisitSettings()), rng) == []
+
+
+def test_a_closed_road_that_was_driven_both_ways_is_held_together_all_along():
+    scans, true, apart, part = _there_and_back(tape_road(220), 0)
+    periods = np.where(np.arange(len(part)) == 220, BREAK_PERIODS, 1.0)
+    known = [Revisit(110, 299, relative_pose(true[110], true[299]), 0.8)]
+    pairs = propose_beside(true, periods, known, HEIGHT_CM, RevisitSettings())
+    found = _matcher(scans, apart, part).matched(pairs, np.random.default_rng(0), true)
+    assert len(found) >= 3
+    off = np.array([r.relative - relative_pose(true[r.earlier], true[r.later]) for r in found])
+    assert np.median(np.abs(off[:, :2])) < 0.1 * HEIGHT_CM
+    facing_each_other = neighbouring_laps(true, HEIGHT_CM, RevisitSettings())
+    # Those that face each other stay six camera heights apart, also around a revisit.
+    for a, b in [*facing_each_other, *loop_pairs(known, part)]:
+        assert 4.0 * HEIGHT_CM < np.hypot(*(true[a] - true[b])[:2]) < 8.0 * HEIGHT_CM
+    assert len(facing_each_other) > 20
 
 
 def test_places_that_differ_do_not_match():
