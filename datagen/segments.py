@@ -130,6 +130,11 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
             f"{camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f} px of {camera.width}x{camera.height}, rolled by "
             f"{np.rad2deg(camera.mounting.roll_rad):.0f} degrees)"
         )
+    elif found.candidates and not found.candidates[0].is_clear:
+        doubt = (
+            f"the camera cannot be found from this drive: with none of the {len(found.candidates)} cameras "
+            "that were tried do the edges of an image clearly meet those of the next one"
+        )
     notes = (found.note, *notes)
     return CameraOfDrive(found.camera, found.how, found.solved, figures, notes, doubt, found.sigma)
 

@@ -15,7 +15,7 @@ from datagen.lanes.trace import TracedLane
 from datagen.segments import LanesOfDrive, SolvedDrive, sigma_of_earlier
 from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleResult
-from datagen.slam.camera.coarse import guessed_camera
+from datagen.slam.camera.coarse import Candidate, Look, guessed_camera
 from datagen.slam.camera.self_calibration import FoundCamera
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.loops.revisits import Revisit
@@ -206,11 +206,14 @@ def test_an_unlikely_camera_is_described_and_an_ordinary_one_is_not_in_doubt(mon
     prepared = replace(_prepared(drive), camera=None)
     solver = SegmentSolver(MapSettings(), np.random.default_rng(0))
     doubts = []
-    for strain in (1.9, 5.2):
-        found = FoundCamera(solved, [], sigma, refined=False, strain=strain)
+    unclear = Candidate(Look(80.0, 15.0), 0.2, 0.05)
+    clear = replace(unclear, fit=0.3)
+    for strain, tried in ((1.9, []), (5.2, []), (1.9, [clear, unclear]), (1.9, [unclear])):
+        found = FoundCamera(solved, tried, sigma, refined=False, strain=strain)
         monkeypatch.setattr(drive_segments, "find_camera", lambda *_, found=found: found)
         doubts.append(drive_segments.camera_of_drive(prepared, solver).doubt)
-    assert doubts[0] == ""
+    assert doubts[0] == doubts[2] == ""
+    assert "with none of the 1 cameras that were tried do the edges of an image" in doubts[3]
     assert "5.2 standard deviations off: principal point at 80, 60 px of 160x120, rolled by 12" in doubts[1]
 
 

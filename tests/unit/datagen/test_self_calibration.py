@@ -129,6 +129,15 @@ def test_a_known_camera_is_refined_on_request_only(tmp_path):
         starting_camera(drive, None, True)
 
 
+def test_an_axis_far_off_the_middle_of_the_image_is_named():
+    ordinary = found(np.linspace(0.0, 4.0 * np.pi, 400))
+    K = np.array(CAMERA.K)
+    K[:2, 2] += [-21.0, 4.0]
+    far_off = replace(ordinary, solved=replace(ordinary.solved, camera=replace(CAMERA, K=K)))
+    assert "-21, +4 px off the middle of the image" in far_off.note
+    assert "off the middle" not in ordinary.note
+
+
 def test_two_laps_determine_the_camera():
     assert check_observable(found(np.linspace(0.0, 4.0 * np.pi, 400)), "d", False) == []
     # A figure of eight turns as much one way as the other.

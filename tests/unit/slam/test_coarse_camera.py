@@ -11,6 +11,7 @@ from pixel_road import fisheye
 
 from datagen.slam.camera.coarse import (
     NOMINAL_HEIGHT_CM,
+    Look,
     clearest_step,
     coarse_camera,
     guessed_camera,
@@ -108,13 +109,11 @@ def test_the_search_finds_the_neighbourhood_of_the_camera(seed):
     assert camera.mounting.height_cm == NOMINAL_HEIGHT_CM and camera.wheelbase_cm == guess.wheelbase_cm
     # The camera is that of the best candidate, and no camera was tried twice.
     best = max(tried, key=lambda candidate: candidate.fit)
-    assert (best.focal_px, best.pitch_deg) == pytest.approx(
+    assert tried[0] is best and (best.look.focal_px, best.look.pitch_deg) == pytest.approx(
         (camera.K[0, 0], np.rad2deg(camera.mounting.pitch_down_rad))
     )
-    assert len({(c.focal_px, c.pitch_deg) for c in tried}) == len(tried) >= 8
-    assert {(f, p) for f in guess.focal_px for p in guess.pitch_deg} <= {
-        (c.focal_px, c.pitch_deg) for c in tried
-    }
+    assert len({c.look for c in tried}) == len(tried) >= 8
+    assert {Look(f, p) for f in guess.focal_px for p in guess.pitch_deg} <= {c.look for c in tried}
     assert all(0.0 < c.fit < np.log1p(10.0) and c.step_heights > 0.0 for c in tried)
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
@@ -162,10 +161,26 @@ def test_a_steep_and_rolled_camera_is_found_where_no_level_one_fits(roll_deg):
     )  # fmt: skip
     camera, tried = coarse_camera(drive, PerceptionSettings(), guess, np.random.default_rng(0))
     found = camera.mounting
-    assert any(c.roll_deg == 0.0 for c in tried) and max(c.fit for c in tried if c.pitch_deg > 24.0) > 0.15
+    assert (
+        any(c.look.roll_deg == 0.0 for c in tried)
+        and max(c.fit for c in tried if c.look.pitch_deg > 24.0) > 0.15
+    )
     assert abs(np.rad2deg(found.pitch_down_rad) - 33.0) < 4.0
     assert abs(np.rad2deg(found.roll_rad) - roll_deg) < 4.0
     assert abs(camera.K[0, 0] / 100.0 - 1.0) < 0.2
+
+
+@pytest.mark.slow
+def test_a_pinhole_whose_axis_is_far_beside_the_middle_is_found():
+    """Images that were rectified with another camera's file."""
+    K = np.array([[70.0, 0.0, 79.5 + 20.0], [0.0, 70.0, 59.5], [0.0, 0.0, 1.0]])
+    usual = fisheye(pitch_down_rad=np.deg2rad(18.0), roll_rad=0.0, yaw_rad=0.0)
+    true = replace(usual, model="pinhole", K=K, D=np.zeros(4))
+    drive, _ = loop_drive(true, 60, 100, 400.0, 0)
+    guess = GuessSettings(focal_px=(65.0, 80.0), pitch_deg=(14.0, 20.0), frames=100)
+    camera, _ = coarse_camera(drive, PerceptionSettings(), guess, np.random.default_rng(0))
+    # Within a step of the walk: with a pinhole, focal length and pitch make up for the rest.
+    assert camera.model == "pinhole" and abs(camera.K[0, 2] - K[0, 2]) < 0.045 * 160.0
 
 
 def test_a_level_camera_costs_no_search_for_steep_ones():
@@ -173,4 +188,4 @@ def test_a_level_camera_costs_no_search_for_steep_ones():
     drive, _ = loop_drive(true, 60, 100, 400.0, 0)
     guess = GuessSettings(focal_px=(65.0, 80.0), pitch_deg=(16.0, 24.0), frames=100)
     _, tried = coarse_camera(drive, PerceptionSettings(), guess, np.random.default_rng(0))
-    assert {c.roll_deg for c in tried} == {0.0} and len(tried) <= 13
+    assert {c.look.roll_deg for c in tried} == {0.0} and len(tried) <= 13
