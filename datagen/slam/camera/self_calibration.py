@@ -109,8 +109,8 @@ class FoundCamera:
 
     @property
     def closed(self) -> bool:
-        """Whether a loop was closed."""
-        return bool(self.solved.revisits)
+        """Whether a loop was closed, and in one way alone."""
+        return self.solved.ties_camera
 
     @property
     def how(self) -> str:
@@ -149,6 +149,8 @@ class FoundCamera:
             return found
         if self.height_given:
             return f"{found}; the focal length fits the lane width at the camera's height"
+        if self.solved.revisits:
+            return f"{found}; laps of another length explain the images as well, each with a lens of its own"
         return f"{found}; no place was seen twice, so the lens is as it started"
 
 
@@ -186,9 +188,8 @@ def find_camera(drive: Drive, start: Camera | None, solver: SegmentSolver) -> Fo
     solved = solver.solve(drive, camera, find_camera=True)
     if start is None:
         solved = _restarted(drive, camera, solved, solver)
-    closed = bool(solved.revisits)
     strain = prior_strain(solved.camera, camera, settings.bundle)
-    sigma = honest_sigma(solved.bundle.sigma, closed, strain, settings.bundle, camera.width)
+    sigma = honest_sigma(solved.bundle.sigma, solved.ties_camera, strain, settings.bundle, camera.width)
     return FoundCamera(solved, candidates, sigma, start is not None, strain)
 
 

@@ -76,8 +76,6 @@ _FIELD_GAIN = 8.0
 _PLACE_PRIOR = 0.1
 #: Cells on each side of a point that it blurs into: two standard deviations of the blur, which is one cell.
 _REACH = 2
-#: Parts into which the poses of a search are cut for threads. Chosen: enough for the cores of a laptop.
-_PARTS = 8
 #: Type of an index: unsigned, so that numba need not check for indices from the end.
 U = np.uint32
 
@@ -375,18 +373,34 @@ class PlaceMatcher:
             rng: Draws edge points and samples.
             closed: Poses by which frames that face each other are found; None where none do.
         """
-        found = []
+        jobs = []
         for earlier, later in pairs:
             about = np.zeros(3) if closed is None else relative_pose(closed[earlier], closed[later])
-            about = about if abs(about[2]) > 0.5 * np.pi else np.zeros(3)
-            found.append(self.match((earlier, later), rng, about))
-        return [revisit for revisit in found if revisit is not None]
+            jobs.append((earlier, later, about if abs(about[2]) > 0.5 * np.pi else np.zeros(3)))
+        return self._all(jobs, rng, None, _MAP_FRAMES)
 
     def turned(
         self, proposed: Sequence[tuple[int, int, Float[np.ndarray, "3"]]], rng: np.random.Generator
     ) -> list[Revisit]:
         """Align the pairs of :func:`propose_turned`."""
-        found = (self.match((a, b), rng, at, _CARRIED_HEIGHTS, _TURNED_FRAMES) for a, b, at in proposed)
+        return self._all(proposed, rng, _CARRIED_HEIGHTS, _TURNED_FRAMES)
+
+    def _all(
+        self,
+        proposed: Sequence[tuple[int, int, Float[np.ndarray, "3"]]],
+        rng: np.random.Generator,
+        along_heights: float | None,
+        frames: int,
+    ) -> list[Revisit]:
+        """Align pairs in threads, each with a generator of its own, so that their order does not count."""
+
+        def aligned(
+            job: tuple[tuple[int, int, Float[np.ndarray, "3"]], np.random.Generator],
+        ) -> Revisit | None:
+            (earlier, later, about), own_rng = job
+            return self.match((earlier, later), own_rng, about, along_heights, frames)
+
+        found = in_threads(aligned, zip(proposed, rng.spawn(len(proposed)), strict=True))
         return [revisit for revisit in found if revisit is not None]
 
     def match(
@@ -518,11 +532,10 @@ class DirectionField(NamedTuple):
             Weighted sum over the points of normal . field, one number per pose; about the weighted number
             of matched points.
         """
-        parts = np.array_split(poses, _PARTS)
-        return np.concatenate(list(in_threads(lambda part: _score(self, part, wheelbase_cm, scan), parts)))
+        return np.asarray(_score(self, poses, wheelbase_cm, scan))
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, nogil=True)
 @no_type_check
 def _insert(field, points, normals, weights):
     vectors, owner, mapped, cell_cm = field.vectors, field.owner, field.mapped, field.cell_cm

