@@ -47,6 +47,7 @@ from datagen.slam.adjustment.state import (
 )
 from datagen.slam.commands import MOST_BRIDGED
 from lanenet.geometry.camera import Camera
+from lanenet.geometry.frames import wrap_angle
 from lanenet.processes import in_threads
 
 __all__ = ["CAMERA_NAMES", "BundleEstimate", "BundleResult", "BundleSettings", "Observations", "adjust"]
@@ -129,8 +130,13 @@ class BundleResult(BundleEstimate):
 
     @property
     def misfit(self) -> float:
-        """Mean robust loss per point in view: the lower, the better the frames agree."""
-        return float(self.loss.sum() / max(int(self.in_view.sum()), 1))
+        """Mean robust loss per point in view: the lower, the better the frames agree.
+
+        Pairs that face each other are left out: what one sees close by the other sees from afar, so that most
+        of its points meet nothing.
+        """
+        turned = np.abs(wrap_angle(np.diff(self.poses[:, 2][self.pairs], axis=1)[:, 0])) < 0.5 * np.pi
+        return float(self.loss[turned].sum() / max(int(self.in_view[turned].sum()), 1))
 
     @property
     def robust_sd_px(self) -> float:
