@@ -544,7 +544,7 @@ class _DenseSegment:
             yield [
                 few if len(few) >= s.min_revisits else group for few, group in zip(left, groups, strict=True)
             ]
-        alike = [r for r in matched if abs(r.relative[2]) < 0.5 * np.pi]
+        alike = [r for r in matched if not r.faces]
         placing = [placing_revisits(poses, self.part, some, self.height) for some in (matched, alike)]
         yield [one for one in placing if len(one) >= s.min_revisits]
         # A wrong camera bends the open loop: then true revisits explain each other better than it does.

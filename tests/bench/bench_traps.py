@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
-from trap_drives import KINDS, TrapDrive, drive_settings
+from trap_drives import KINDS, TrapDrive, beyond_lines, drive_settings
 
 from datagen.labels.truth import true_lines
 from datagen.pipeline import MapRequest, map_drive
@@ -63,9 +63,7 @@ def label_errors(folder: Path, drive: Path, wheelbase_cm: float) -> dict[str, An
     index = read_map(folder).frames
     true_points = np.stack([truth[point] for point in POINT_NAMES], axis=1)
     true_points = np.array([BirdseyeWindow().labelled(points) for points in true_points])
-    # Beyond a line of a road of one lane, map and truth may count another lane, and both are right.
-    beyond = (true_points[:, 0] > 0.0) | (true_points[:, len(ROWS_CM)] < 0.0)
-    true_points[true_lines(drive, truth, wheelbase_cm)[1] | beyond] = np.nan
+    true_points[true_lines(drive, truth, wheelbase_cm)[1] | beyond_lines(true_points)] = np.nan
     miss_cm = np.full_like(true_points, np.nan)
     miss_cm[index] = read_map_frames(folder).points_cm - true_points[index]
     xy = np.stack([truth["x_cm"], truth["y_cm"]], axis=1)

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from trap_drives import beyond_lines
 
 from datagen.labels.truth import true_lines
 from datagen.quality.evidence import label_features
@@ -51,9 +52,9 @@ def label_table(mapped: MappedDrive, map_folder: Path, drive_path: Path) -> dict
     points_cm = window.labelled(projected(drive_map))
     true_cm = np.stack([truth[name] for name in POINT_NAMES], axis=1)[rows]
     error_cm = points_cm - true_cm
-    # Beyond a line of a road of one lane, map and truth may count another lane, and both are right.
-    beyond = (true_cm[:, 0] > 0.0) | (true_cm[:, len(ROWS_CM)] < 0.0)
-    error_cm[between | beyond | drive_map.lanes.between | mapped.drive.deleted[mapped.rows]] = np.nan
+    error_cm[
+        between | beyond_lines(true_cm) | drive_map.lanes.between | mapped.drive.deleted[mapped.rows]
+    ] = np.nan
     features = label_features(mapped, read_json(map_folder / "report.json", MapFormatError))
     frame, point = np.nonzero(np.isfinite(error_cm))
     at = frame, point

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from datagen.world.car.car import Car
 from datagen.world.car.driver import Driver
@@ -37,6 +38,7 @@ from datagen.world.world import SimulationSettings, World, build_world
 from lanenet.config import dump_settings
 from lanenet.data.drives.folder import DriveWriter
 from lanenet.data.files import write_text
+from lanenet.geometry.lane import ROWS_CM
 
 TRAPS = ("corners", "straights", "eight", "pulses", "pauses", "kinks", "widening", "dark", "wide", "mixed")
 SPEED_CM_S, RATE_HZ, LAPS = 70.0, 20.0, 2.1
@@ -103,6 +105,14 @@ class TrapDrive:
             write_legs(self.settings, self.legs, out)
         else:
             simulate_drive(self.settings, out)
+
+
+def beyond_lines(true_cm: Float[np.ndarray, "n 6"]) -> Bool[np.ndarray, "n"]:
+    """Frames whose front axle's middle lies beyond a line of their true lane.
+
+    On a road of one lane, map and truth may then count another lane, and both are right.
+    """
+    return (true_cm[:, 0] > 0.0) | (true_cm[:, len(ROWS_CM)] < 0.0)
 
 
 def write_legs(settings: SimulationSettings, legs: Sequence[Leg], out: Path) -> None:

@@ -135,8 +135,8 @@ class BundleResult(BundleEstimate):
         Pairs that face each other are left out: what one sees close by the other sees from afar, so that most
         of its points meet nothing.
         """
-        turned = np.abs(wrap_angle(np.diff(self.poses[:, 2][self.pairs], axis=1)[:, 0])) < 0.5 * np.pi
-        return float(self.loss[turned].sum() / max(int(self.in_view[turned].sum()), 1))
+        same_way = np.abs(wrap_angle(np.diff(self.poses[:, 2][self.pairs], axis=1)[:, 0])) < 0.5 * np.pi
+        return float(self.loss[same_way].sum() / max(int(self.in_view[same_way].sum()), 1))
 
     @property
     def robust_sd_px(self) -> float:

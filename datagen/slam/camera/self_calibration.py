@@ -150,7 +150,7 @@ class FoundCamera:
         if self.height_given:
             return f"{found}; the focal length fits the lane width at the camera's height"
         if self.solved.revisits:
-            return f"{found}; laps of another length explain the images as well, each with a lens of its own"
+            return f"{found}; the images do not tell how long a lap is, which leaves the lens open"
         return f"{found}; no place was seen twice, so the lens is as it started"
 
 

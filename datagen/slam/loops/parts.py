@@ -68,6 +68,7 @@ def placing_revisits(
             pair = sorted((int(part[r.earlier]), int(part[r.later])))
             between.setdefault((pair[0], pair[1]), []).append(r)
     path, group, placed = path_lengths(poses), part.copy(), poses.copy()
+    breaks = np.flatnonzero(np.diff(part))
     sets = []
     for (_, moved), found in between.items():
         for _ in range(_MOST_RIVALS):
@@ -84,9 +85,9 @@ def placing_revisits(
         a, b = group[r.earlier], group[r.later]
         mine = group == b
         trial[mine] = moved_rigidly(placed[mine], placed[r.later], compose(placed[r.earlier], r.relative))
-        ends = np.sort(np.stack([group[:-1], group[1:]]), axis=0)
-        breaks = np.flatnonzero((ends[0] == min(a, b)) & (ends[1] == max(a, b)))
-        likelihood = min(len(agreeing), JOINED) - carried(trial, breaks, camera_height_cm)
+        before, after = group[breaks], group[breaks + 1]
+        joining = breaks[((before == a) & (after == b)) | ((before == b) & (after == a))]
+        likelihood = min(len(agreeing), JOINED) - carried(trial, joining, camera_height_cm)
         return (likelihood, len(agreeing)), trial
 
     chosen: list[Revisit] = []

@@ -132,9 +132,7 @@ def loop_pairs(revisits: list[Revisit], part: Int[np.ndarray, "n"]) -> list[tupl
     count = len(part)
     # Of two cars that face each other, one comes where the other came from.
     pairs = [
-        (r, r.earlier + d, r.later - d if abs(r.relative[2]) > 0.5 * np.pi else r.later + d)
-        for r in revisits
-        for d in _AROUND_REVISIT
+        (r, r.earlier + d, r.later - d if r.faces else r.later + d) for r in revisits for d in _AROUND_REVISIT
     ]
     return [
         (a, b)

@@ -131,6 +131,11 @@ class Revisit:
     match: float
     turns: int = 0
 
+    @property
+    def faces(self) -> bool:
+        """Whether the frames face each other: they see the same road from both sides."""
+        return bool(abs(self.relative[2]) > 0.5 * np.pi)
+
 
 def thumbnails(drive: Drive) -> Float[np.ndarray, "n d"]:
     """Return a small, contrast-normalised image of each frame as a unit vector.
