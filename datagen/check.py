@@ -68,9 +68,10 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     drive, drive_map, free_cm = prepared.drive, assembled.drive_map, assembled.free_lane_cm
     notes = map_notes(drive_map, assembled.segments, len(drive), free_cm is not None)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
+    # As they were traced: what is withheld of a false line is what would tell that it is one.
+    check_lines_seen(held_out_residuals(mapped), drive, drive_map.meta.lane_width_cm, free_cm)
     mapped, quality = compare_with_frames(mapped, camera_figures)
     drive_map = mapped.drive_map
-    check_lines_seen(quality.held_out, drive, drive_map.meta.lane_width_cm, free_cm)
     request = prepared.request
     figures = quality.figures(drive_map) | {
         "segments_mapped": assembled.segments,
@@ -119,7 +120,7 @@ def check_lines_seen(
     """Refuse lines that held-out frames do not show: clutter along the path.
 
     Args:
-        held_out: Residuals of the map's held-out frames.
+        held_out: Residuals of the map's held-out frames, nothing withheld of the lines.
         drive: The drive.
         lane_width_cm: The given lane width.
         free_lane_cm: Lane width found without the given one, if it fits better; else None.
