@@ -131,7 +131,7 @@ def assemble(
     meta = MapMeta(
         format=FORMAT,
         drive=str(request.drive_path),
-        lane_width_cm=request.lane_width_cm,
+        lane_width_cm=lane.width_cm if longest.is_one_of_several else request.lane_width_cm,
         mapped_lane_cm=factor * lane.width_cm,
         tape_cm=factor * float(np.median(markings_cm)),
         scale_from="lane width" if prepared.camera is None else "camera",

@@ -79,6 +79,7 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
         "steering_correlation": steering_answer(mapped),
         "pauses": prepared.pauses,
         "given": {
+            "lane_width_cm": request.lane_width_cm,
             "camera_height_cm": request.camera_height_cm,
             "tape_width_cm": request.tape_width_cm,
         },

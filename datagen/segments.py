@@ -122,13 +122,13 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
         found, notes = fit_height(found, drive, width_cm / height_cm, prepared.settings, solver)
     figures = {"calibration": found.figures}
     doubt = ""
-    if found.strain > MAX_STRAIN:
+    if found.strain > MAX_STRAIN[1]:
         camera = found.camera
         doubt = (
             "the camera cannot be found from this drive: the one that fits best is unlike ordinary ones "
-            f"(principal point or roll {found.strain:.1f} standard deviations off: principal point at "
-            f"{camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f} px of {camera.width}x{camera.height}, rolled by "
-            f"{np.rad2deg(camera.mounting.roll_rad):.0f} degrees)"
+            f"(principal point, roll or odometry {found.strain:.1f} standard deviations off: principal "
+            f"point at {camera.K[0, 2]:.0f}, {camera.K[1, 2]:.0f} px of {camera.width}x{camera.height}, "
+            f"rolled by {np.rad2deg(camera.mounting.roll_rad):.0f} degrees)"
         )
     elif found.candidates and not found.candidates[0].is_clear:
         doubt = (
@@ -301,7 +301,8 @@ def fit_lanes(
             mapped.append(one)
             # A road keeps its width and its markings; the longest segment shows them best.
             dark = one.dark
-            lane_cm = lane_cm or fitted_width(one.lines, one.lane, one.s_frames_cm).width_cm
+            if lane_cm is None or one.is_one_of_several:
+                lane_cm = fitted_width(one.lines, one.lane, one.s_frames_cm).width_cm
     if not mapped:
         reason = failed[0].reason  # of the longest
         if doubt:

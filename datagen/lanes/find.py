@@ -52,7 +52,8 @@ class MappedSegment:
         lane: The traced lane.
         lines: Its two lines, then those of adjacent lanes.
         dark: Whether the markings are darker than the floor.
-        free_lane_cm: Lane width found without the given one, if it fits better; else None.
+        free_lane_cm: Lane width found without the given one, if it fits better; else None. That of the lane
+            itself, where the given one is that of several lanes, of which the car keeps to one.
     """
 
     solved: SolvedSegment
@@ -62,6 +63,11 @@ class MappedSegment:
     lines: list[LaneLine]
     dark: bool = False
     free_lane_cm: float | None = None
+
+    @property
+    def is_one_of_several(self) -> bool:
+        """Whether it is one of the lanes between the two lines to which the given width belongs."""
+        return self.free_lane_cm == self.lane.lane_cm
 
     @property
     def rows(self) -> Int[np.ndarray, "n"]:

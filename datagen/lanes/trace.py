@@ -133,7 +133,8 @@ def trace_known_lane(
 
     Returns:
         The lane, and the width that the free search found; None if it found none, or if the given width fits
-        the road as well.
+        the road as well. Where two lines of the given width bound several lanes, of which the car keeps to
+        one, that one is the lane, and its own width is the free one.
 
     Raises:
         CalibrationError: If there is no lane of this width but one of another; names both.
@@ -159,7 +160,10 @@ def trace_known_lane(
         raise other_lane(lane_width_cm, free.lane_cm)
     if lane is None:
         raise TrackingLostError(f"no two lines {lane_width_cm:g} cm apart run along the drive")
-    return lane, free.lane_cm if free is not None and _fits_better(free, lane) else None
+    if free is None or not _fits_better(free, lane):
+        return lane, None
+    within = free.lane_cm < lane.lane_cm and min(*lane.seen, *free.seen) >= MAYBE_LINE
+    return free if within and _is_kept_to(free, lane) else lane, free.lane_cm
 
 
 def other_lane(given_cm: float, found_cm: float) -> CalibrationError:
@@ -178,10 +182,15 @@ def _fits_better(free: TracedLane, lane: TracedLane) -> bool:
     less than that of the free lane, or the car keeps to the centre of the free lane and not to that of the
     given one, as on a road of two lanes whose whole width was given.
     """
-    if min(lane.seen) < _WEAKER * min(free.seen):
-        return True
+    return min(lane.seen) < _WEAKER * min(free.seen) or (
+        min(free.seen) >= LEAST_SEEN and _is_kept_to(free, lane)
+    )
+
+
+def _is_kept_to(free: TracedLane, lane: TracedLane) -> bool:
+    """Whether the car keeps to the centre of the first lane, and beside that of the second."""
     aside = [abs(float(np.median(one.centre_cm))) / one.lane_cm for one in (lane, free)]
-    return min(free.seen) >= LEAST_SEEN and aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
+    return aside[0] > 0.15 and aside[1] < 0.5 * aside[0]
 
 
 def trace_adjacent(

@@ -15,7 +15,7 @@ from datagen.quality.residuals import coverage
 from datagen.quality.verdict import MapEvidence
 from datagen.slam.commands import BREAK_PERIODS, commands_of, fit_steering
 from datagen.slam.loops.pose_graph import revisit_residuals
-from lanenet.data.maps.folder import DriveMap
+from lanenet.data.maps.folder import DriveMap, MapMeta
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -80,8 +80,10 @@ def scaled_figures(segments: list[dict[str, Any]], factor: float) -> list[dict[s
 
 
 def free_lane_cm(parts: list[MappedSegment]) -> float | None:
-    """Median of the segments' freely found lane widths; None if they have none."""
-    free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
+    """Median of the freely found lane widths of segments whose lane has another one; None if none has."""
+    free = [
+        part.free_lane_cm for part in parts if part.free_lane_cm is not None and not part.is_one_of_several
+    ]
     return float(np.median(free)) if free else None
 
 
@@ -142,6 +144,7 @@ def map_evidence(
         found_lane_cm=None if meta.scale_from == "lane width" else found_cm,
         height_cm=height_cm,
         tape_cm=meta.tape_cm,
+        outer_lane_cm=_outer_lane_cm(figures["given"]["lane_width_cm"], meta),
         given_height_cm=figures["given"]["camera_height_cm"],
         given_tape_cm=figures["given"]["tape_width_cm"],
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
@@ -150,6 +153,11 @@ def map_evidence(
         segments=len(segments),
         pauses=figures.get("pauses", 0),
     )
+
+
+def _outer_lane_cm(given_cm: float, meta: MapMeta) -> float | None:
+    """Given width where it is that of several lanes; None where it is that of the mapped one."""
+    return given_cm if meta.scale_from == "camera" and meta.lane_width_cm != given_cm else None
 
 
 def tape_range_cm(lines: Sequence[LaneLine]) -> tuple[float, float] | None:

@@ -83,7 +83,8 @@ class MapEvidence:
         tape_cm: Width of the markings that follows from it.
         ahead_cm: Distance of the camera ahead of the front axle.
         laps: Whole turns that the car has driven, or laps between revisits where these are more.
-        strain: Distance of a found camera's principal point and roll from those of ordinary ones, in sigmas.
+        strain: Distance of a found camera's principal point and roll from those of ordinary ones, and of its
+            odometry from the closed loops, in sigmas.
         segments: Number of segments of the map.
         pauses: How often the recording pauses, if it does so again and again.
         wrong_share: Share of the lines' length in sections that the images contradict.
@@ -91,6 +92,8 @@ class MapEvidence:
         comes_round: Whether the road of every segment ends where it begins.
         bend_lane_cm: Width of the lane in bends, if it is another one there; else None.
         open_lane_cm: Narrowest and widest tenth of a lane of many widths that has no straight; else None.
+        outer_lane_cm: Lane width that the user gave, if the lines that are so far apart bound several lanes,
+            of which one was driven and mapped; else None.
         given_height_cm: Height of the camera that the user gave; None if none was given.
         given_tape_cm: Width of the tape that the user gave; None if none was given.
         tape_range_cm: Narrowest and widest twentieth of the tape along the line on which it varies most; None
@@ -118,6 +121,7 @@ class MapEvidence:
     comes_round: bool = True
     bend_lane_cm: float | None = None
     open_lane_cm: tuple[float, float] | None = None
+    outer_lane_cm: float | None = None
     given_height_cm: float | None = None
     given_tape_cm: float | None = None
     tape_range_cm: tuple[float, float] | None = None
@@ -439,10 +443,10 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
             least=True,
         )  # fmt: skip
     yield Check(
-        "max_strain", "the camera's principal point or roll is {} from those of ordinary cameras", e.strain,
-        MAX_STRAIN, s.usable * MAX_STRAIN,
-        "the camera that fits the images is unlike ordinary ones, so that a place may have been taken for "
-        "another that looks like it", _CAMERA_FILE, "sigmas",
+        "max_strain", "the camera is {} from ordinary ones, by its principal point, its roll and the heading "
+        "that its odometry misses in a lap", e.strain, *MAX_STRAIN,
+        "the camera that fits the images is unlike ordinary ones, or its odometry is unlike the closed "
+        "loops, so that a place may have been taken for another that looks like it", _CAMERA_FILE, "sigmas",
     )  # fmt: skip
     for name, what, key, bound, unit in (
         ("max_focal_sigma", "focal length", "focal", s.max_focal_sigma, "%"),
@@ -545,6 +549,14 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
         yield (
             f"the tape is {low:.1f} cm wide in some places and {high:.1f} cm in others: tape of several "
             "widths, light that fades, or a floor that is not flat; then lengths are wrong by as much"
+        )
+    if e.outer_lane_cm is not None:
+        height_cm = e.height_cm * e.outer_lane_cm / e.given_lane_cm
+        yield (
+            f"the two lines that are {e.outer_lane_cm:g} cm apart bound several lanes, and the car drives in "
+            f"one of {e.given_lane_cm:.1f} cm, which was mapped: give that width. If the driven lane is "
+            f"{e.outer_lane_cm:g} cm wide, the camera is {height_cm:.0f} cm high, not "
+            f"{e.height_cm:.0f} cm, and needs another camera file"
         )
     if e.bend_lane_cm is not None:
         width_cm = e.given_lane_cm if e.found_lane_cm is None else e.found_lane_cm

@@ -110,7 +110,8 @@ def test_a_rescaled_map_is_the_map_of_the_other_width(drive: Path, tmp_path: Pat
     for name in ("trajectory.tum", "open_loop.tum"):
         np.testing.assert_allclose(np.loadtxt(one / name), np.loadtxt(other / name), SAME, SAME)
     pictures = [cv2.imread(str(folder / "map.png")) for folder in (one, other)]
-    np.testing.assert_array_equal(*pictures)
+    # Lengths that differ in the last digit may round to the next pixel.
+    assert (pictures[0] != pictures[1]).mean() < 1e-6
     for name in ("settings.yaml", "map.done.json"):
         assert (one / name).read_text() == (other / name).read_text()
 

@@ -48,6 +48,34 @@ def test_which_lane_is_driven(free, lane, better):
     ],
 )
 def test_another_width_is_named_where_two_lines_are_seen(monkeypatch, free, lane, message):
+    with pytest.raises((CalibrationError, TrackingLostError), match=message):
+        chosen(monkeypatch, free, lane)
+
+
+@pytest.mark.parametrize(
+    ("free", "lane", "mapped"),
+    [
+        # A road of two lanes, told as a whole: all its lines are seen, the car keeps to the right lane.
+        (traced(20.0, 0.5, 0.8, 1.0), traced(40.0, 10.0, 1.0, 1.0), "free"),
+        # The same, but the line in the middle is seen in few places.
+        (traced(20.0, 0.5, 0.3, 1.0), traced(40.0, 10.0, 1.0, 1.0), "told"),
+        # The driven lane is the wider one: the told lines lie within it, and may be anything.
+        (traced(60.0, 0.5, 1.0, 1.0), traced(40.0, 10.0, 1.0, 1.0), "told"),
+        # The car keeps to the middle of what was told.
+        (traced(20.0, 10.0, 1.0, 1.0), traced(40.0, 0.0, 1.0, 1.0), "agreed"),
+    ],
+)
+def test_the_lane_that_is_driven_is_mapped_where_the_width_of_several_was_told(
+    monkeypatch, free, lane, mapped
+):
+    found, free_cm = chosen(monkeypatch, free, lane)
+    assert found is (free if mapped == "free" else lane)
+    assert free_cm == (None if mapped == "agreed" else free.lane_cm)
+
+
+def chosen(monkeypatch, free: TracedLane, lane: TracedLane | None) -> tuple[TracedLane, float | None]:
+    """The lane that is mapped where 40 cm were told, if these are found freely and with that width."""
+
     def trace(path, edges, height_cm, lane_width_cm, settings):
         found = free if lane_width_cm is None else lane
         if found is None:
@@ -58,5 +86,4 @@ def test_another_width_is_named_where_two_lines_are_seen(monkeypatch, free, lane
     path = path_of_poses(np.column_stack([np.arange(0.0, 99.0, 3.0), np.zeros(33), np.zeros(33)]), 2.0, 9.0)
     none = np.zeros(0, dtype=np.int64)
     edges = PathEdges(*[np.zeros(0)] * 6, none)
-    with pytest.raises((CalibrationError, TrackingLostError), match=message):
-        trace_known_lane(path, edges, 17.0, 40.0, TraceSettings())
+    return trace_known_lane(path, edges, 17.0, 40.0, TraceSettings())

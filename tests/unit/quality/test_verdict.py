@@ -79,7 +79,7 @@ ROWS = [
     ("min_in_view", lambda x: {"in_view": x}, S.min_in_view, None),
     ("max_closure_heights", lambda x: {"closure_across_heights": x}, S.max_closure_heights, None),
     ("min_revisits", lambda x: {"revisits": round(x)}, S.min_revisits, S.min_revisits // 2),
-    ("max_strain", lambda x: {"strain": x}, MAX_STRAIN, 2.0 * MAX_STRAIN),
+    ("max_strain", lambda x: {"strain": x}, *MAX_STRAIN),
     ("max_focal_sigma", lambda x: {"sigma": {"focal": x}}, S.max_focal_sigma, 2.0 * S.max_focal_sigma),
     (
         "max_pitch_sigma_rad",
@@ -124,7 +124,7 @@ def test_every_row_at_its_bounds(name, made, good, usable):
 
 def test_what_the_user_set_moves_the_bounds():
     loose = VerdictSettings(max_off=0.05, tape_cm=(0.8, 15.0), min_frames=10, usable=3.0)
-    wide = changed(GOOD, off_3=0.04, tape_cm=12.0, labelled=12, strain=2.5 * MAX_STRAIN)
+    wide = changed(GOOD, off_3=0.04, tape_cm=12.0, labelled=12, strain=1.2 * MAX_STRAIN[0])
     assert [(check.name, check.grade) for check in checks(wide, loose) if check.grade != "good"] == [
         ("max_strain", "usable")
     ]
@@ -192,12 +192,12 @@ def test_the_map_is_judged_apart_from_its_labels(changes, state):
 
 
 def test_the_worst_comes_first_and_of_one_grade_the_cause():
-    verdict = judged(off_3=0.1, labelled=200, strain=1.1 * MAX_STRAIN)
+    verdict = judged(off_3=0.1, labelled=200, strain=1.1 * MAX_STRAIN[0])
     names = [reason.rsplit("(", 1)[1].rstrip(")") for reason in verdict.reasons]
     assert verdict.grade == "reject" and names == ["max_off", "max_strain", "min_frames"]
     assert (
         "2 more findings" in verdict.sentence
-        and "more finding" not in judged(strain=1.1 * MAX_STRAIN).sentence
+        and "more finding" not in judged(strain=1.1 * MAX_STRAIN[0]).sentence
     )
 
 
@@ -246,6 +246,7 @@ def test_what_else_there_is_to_know():
     assert not more(labelled=860) and len(more(labelled=840)) == 1
     assert not more(tape_range_cm=(4.0, 4.9)) and len(more(tape_range_cm=(4.0, 5.1))) == 1
     assert len(more(bend_lane_cm=49.3)) == 1
+    assert any("85 cm" in remark and "36 cm high" in remark for remark in more(outer_lane_cm=85.0))
     assert not more(steering=0.9) and len(more(steering=-0.9)) == 1
     # The scale of a lane is told with what follows from it; that of a given camera is not.
     assert any("17.0 cm high" in remark and "40 cm" in remark for remark in judged().remarks)
