@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from datagen.lanes.find import MappedSegment
 from datagen.lanes.scale import LaneWidth, ahead_sigma, fitted_width
 from datagen.prepare import PreparedDrive
-from datagen.quality.figures import free_lane_cm, map_edges, scaled_figures, segment_figures
+from datagen.quality.figures import map_edges, segment_figures
 from datagen.slam.camera.coarse import with_known_scale
 from datagen.slam.odometry.scans import distances_seen
 from lanenet.data.maps.folder import FORMAT, DriveMap, MapMeta
@@ -35,7 +35,7 @@ class AssembledMap:
         edges: Columns of all edge points, see :func:`datagen.quality.figures.map_edges`.
         open_poses: Poses before loops were closed.
         segments: Figures of each segment, see :func:`datagen.quality.figures.segment_figures`.
-        free_lane_cm: See :func:`datagen.quality.figures.free_lane_cm`.
+        free_lane_cm: Median of the segments' freely found lane widths that fit better; None if none does.
         factor: What turned the lengths of the camera that was solved with into centimetres.
     """
 
@@ -164,9 +164,23 @@ def assemble(
         map_edges(segments, drive.frames, factor),
         _in_order(segments, [s.solved.open_poses for s in segments]) * _pose_scale(factor),
         segment_figures(segments, factor),
-        free_lane_cm(segments),
+        _free_lane_cm(segments),
         factor,
     )
+
+
+def scaled_figures(segments: list[dict[str, Any]], factor: float) -> list[dict[str, Any]]:
+    """Multiply the lengths in segments' figures by a factor: those under names in ``_cm``."""
+    return [
+        {name: factor * x if name.endswith("_cm") and x is not None else x for name, x in one.items()}
+        for one in segments
+    ]
+
+
+def _free_lane_cm(parts: list[MappedSegment]) -> float | None:
+    """Median of the segments' freely found lane widths; None if they have none."""
+    free = [part.free_lane_cm for part in parts if part.free_lane_cm is not None]
+    return float(np.median(free)) if free else None
 
 
 def _pose_scale(factor: float) -> Float[np.ndarray, "3"]:

@@ -52,8 +52,8 @@ class MappedSegment:
         lane: The traced lane.
         lines: Its two lines, then those of adjacent lanes.
         dark: Whether the markings are darker than the floor.
-        free_lane_cm: Lane width found without the given one, if it fits better; else None. That of the lane
-            itself, where the given one is that of several lanes, of which the car keeps to one.
+        free_lane_cm: Lane width found without the given one, if it fits better; else None.
+        is_one_of_several: Whether the given width is that of several lanes, of which the car keeps to this.
     """
 
     solved: SolvedSegment
@@ -63,11 +63,7 @@ class MappedSegment:
     lines: list[LaneLine]
     dark: bool = False
     free_lane_cm: float | None = None
-
-    @property
-    def is_one_of_several(self) -> bool:
-        """Whether it is one of the lanes between the two lines to which the given width belongs."""
-        return self.free_lane_cm == self.lane.lane_cm
+    is_one_of_several: bool = False
 
     @property
     def rows(self) -> Int[np.ndarray, "n"]:
@@ -115,6 +111,7 @@ def find_lane(
         lane = trace_lane(path, edges, height, None, trace)
     else:
         lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, trace)
+    several = free_cm == lane.lane_cm
     # Also where the car drives near the line between the lanes.
     _, adjacent = edges_of_segment(segment, scans, path, _NEXT_LANE_REACH * lane.lane_cm)
     adjacent = without_crossings(path, adjacent.towards_dark() if dark else adjacent, height, side_cm)
@@ -124,7 +121,8 @@ def find_lane(
     near = near.towards_dark() if dark else near
     lines = [with_kinks(line, near, height, lane.lane_cm) if line.rank == 0 else line for line in lines]
     lines = [replace(line, marking_at_cm=marking_widths(line, near, height)) for line in lines]
-    return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm)
+    free_cm = None if several else free_cm
+    return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm, several)
 
 
 def _laps(segment: SolvedSegment, path: Path) -> Int[np.ndarray, "n"]:

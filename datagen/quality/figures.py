@@ -15,7 +15,7 @@ from datagen.quality.residuals import coverage
 from datagen.quality.verdict import MapEvidence
 from datagen.slam.commands import BREAK_PERIODS, commands_of, fit_steering
 from datagen.slam.loops.pose_graph import revisit_residuals
-from lanenet.data.maps.folder import DriveMap, MapMeta
+from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.maps.mapped_drive import MappedDrive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
@@ -71,22 +71,6 @@ def segment_figures(parts: list[MappedSegment], factor: float) -> list[dict[str,
     return segments
 
 
-def scaled_figures(segments: list[dict[str, Any]], factor: float) -> list[dict[str, Any]]:
-    """Multiply the lengths in segments' figures by a factor: those under names in ``_cm``."""
-    return [
-        {name: factor * x if name.endswith("_cm") and x is not None else x for name, x in one.items()}
-        for one in segments
-    ]
-
-
-def free_lane_cm(parts: list[MappedSegment]) -> float | None:
-    """Median of the freely found lane widths of segments whose lane has another one; None if none has."""
-    free = [
-        part.free_lane_cm for part in parts if part.free_lane_cm is not None and not part.is_one_of_several
-    ]
-    return float(np.median(free)) if free else None
-
-
 def steering_answer(mapped: MappedDrive) -> float | None:
     """Correlate the path's curvature with the steering command, at the delay where that is strongest.
 
@@ -116,9 +100,10 @@ def map_evidence(
         drive_map: The map.
         figures: Figures of the map.
         quality: What its frames show of it.
-        free_cm: See :func:`free_lane_cm`.
+        free_cm: Lane width found without the given one, if it fits better; else None.
     """
     meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
+    told_cm = figures["given"]["lane_width_cm"]
     calibration = figures.get("calibration", {})
     segments = figures["segments_mapped"]
     revisits = sum(segment["revisits"] for segment in segments)
@@ -137,6 +122,7 @@ def map_evidence(
         closure_across_heights=across_cm / revisits / height_cm if revisits else None,
         sigma={} if known else calibration["sigma"],
         # Reports of earlier versions do not know.
+        alike=not known and bool(revisits) and not calibration.get("closed", True),
         strain=0.0 if known else calibration.get("strain", 0.0),
         given_lane_cm=meta.lane_width_cm,
         bend_lane_cm=figures["lane_width"]["bend_cm"],
@@ -144,7 +130,8 @@ def map_evidence(
         found_lane_cm=None if meta.scale_from == "lane width" else found_cm,
         height_cm=height_cm,
         tape_cm=meta.tape_cm,
-        outer_lane_cm=_outer_lane_cm(figures["given"]["lane_width_cm"], meta),
+        # The map of a known camera has another lane width than the given one only then.
+        outer_lane_cm=None if meta.lane_width_cm == told_cm or meta.scale_from != "camera" else told_cm,
         given_height_cm=figures["given"]["camera_height_cm"],
         given_tape_cm=figures["given"]["tape_width_cm"],
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
@@ -153,11 +140,6 @@ def map_evidence(
         segments=len(segments),
         pauses=figures.get("pauses", 0),
     )
-
-
-def _outer_lane_cm(given_cm: float, meta: MapMeta) -> float | None:
-    """Given width where it is that of several lanes; None where it is that of the mapped one."""
-    return given_cm if meta.scale_from == "camera" and meta.lane_width_cm != given_cm else None
 
 
 def tape_range_cm(lines: Sequence[LaneLine]) -> tuple[float, float] | None:
@@ -178,7 +160,7 @@ def map_notes(drive_map: DriveMap, segments: list[dict[str, Any]], frames: int, 
         drive_map: The map.
         segments: Their figures.
         frames: Number of frames of the drive.
-        free: Whether the mapped lane is not the road's, see :func:`free_lane_cm`.
+        free: Whether a lane of another width fits the road better than the mapped one.
     """
     meta = drive_map.meta
     revisits = sum(segment["revisits"] for segment in segments)

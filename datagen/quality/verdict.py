@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from datagen.slam.camera.self_calibration import MAX_FOCAL_SIGMA, MAX_STRAIN, MIN_REVISITS
 from lanenet.config import Settings
@@ -85,6 +85,7 @@ class MapEvidence:
         laps: Whole turns that the car has driven, or laps between revisits where these are more.
         strain: Distance of a found camera's principal point and roll from those of ordinary ones, and of its
             odometry from the closed loops, in sigmas.
+        alike: Whether places were seen twice, but do not tell how long a lap is.
         segments: Number of segments of the map.
         pauses: How often the recording pauses, if it does so again and again.
         wrong_share: Share of the lines' length in sections that the images contradict.
@@ -117,6 +118,7 @@ class MapEvidence:
     segments: int
     pauses: int
     wrong_share: float
+    alike: bool = False
     wrong: tuple[str, ...] = ()
     comes_round: bool = True
     bend_lane_cm: float | None = None
@@ -131,7 +133,7 @@ class MapEvidence:
 #: Bounds of earlier versions, which no check uses any more.
 _OLDER = frozenset(
     ("max_sd_px", "max_p95_px", "min_samples", "min_labelled", "min_coverage", "max_contradicted")
-    + ("max_withheld", "max_tape_ratio", "lane_reject", "tape_mismatch", "max_strain")
+    + ("max_withheld", "max_tape_ratio", "lane_reject", "tape_mismatch", "max_strain", "min_revisits")
 )
 
 
@@ -154,8 +156,6 @@ class VerdictSettings(Settings):
         max_pitch_sigma_rad: Sigma of the camera's pitch, if it was found from the drive. Chosen: 1.7 degrees;
             the principal point takes on most of what the pitch is off. Labels of ``donkey_circuit`` with
             cameras from two parts of it (sigma 0.013 and 0.017) lie 0.4 cm from those of the whole (0.022).
-        min_revisits: Places seen twice that a camera needs which was found from the drive. Chosen: as for
-            ``lanenet calibrate drive``; the three recorded drives have 38 and more.
         max_closure_heights: Median error of a revisit across the road, in camera heights. A study of three
             recorded drives reached 0.03.
         lane_mismatch: Relative difference of the lane width that the camera measures, or of the tape's width
@@ -178,7 +178,6 @@ class VerdictSettings(Settings):
     min_in_view: float = Field(default=0.25, gt=0.0, lt=1.0)
     max_focal_sigma: PositiveFloat = MAX_FOCAL_SIGMA
     max_pitch_sigma_rad: float = Field(default=0.03, gt=0.0)
-    min_revisits: NonNegativeInt = MIN_REVISITS
     max_closure_heights: float = Field(default=0.15, gt=0.0)
     lane_mismatch: float = Field(default=0.25, gt=0.0)
     usable: float = Field(default=2.0, gt=1.0)
@@ -348,8 +347,8 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
         return "wrong in sections", f", of which the longest is {e.wrong[0]}" if e.wrong else ""
     if e.segments > 1:
         return "open", f": its {e.segments} segments show no place of each other"
-    if not e.revisits:
-        return "open", ": no place was certainly seen twice"
+    if not e.revisits or e.alike:
+        return "open", ": how long a lap is stays open" if e.alike else ": no place was certainly seen twice"
     return ("closed", "") if e.comes_round else ("open", ": the road does not come round")
 
 
@@ -424,7 +423,11 @@ def _why_not(e: MapEvidence) -> tuple[str, str]:
 def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     """Rows on a camera that was found, and on loops that were closed with it."""
     laps = "drive two laps of a closed road along the same path, or "
-    remedy = f"{'' if e.laps >= 2 or e.revisits >= s.min_revisits else laps}{_CAMERA_FILE}"
+    few = e.laps < 2 and e.revisits < MIN_REVISITS
+    why = ", for hardly a place was seen twice" if few else ""
+    if e.alike:
+        why = ", for places look alike all along the road, as along a circle: how long a lap is stays open"
+    remedy = f"{laps if few and not e.alike else ''}{_CAMERA_FILE}"
     if e.given_height_cm is None:
         remedy += ", or its height (--camera-height)"
     if e.closure_across_heights is not None:
@@ -435,13 +438,6 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
         )  # fmt: skip
     if not e.sigma:
         return
-    if e.given_height_cm is None:
-        yield Check(
-            "min_revisits", "the camera was found from {} places seen twice", e.revisits, s.min_revisits,
-            s.min_revisits / s.usable if e.revisits else 0,
-            "the drive does not show what camera this is, for hardly a place was seen twice", remedy, "",
-            least=True,
-        )  # fmt: skip
     yield Check(
         "max_strain", "the camera is {} from ordinary ones, by its principal point, its roll and the heading "
         "that its odometry misses in a lap", e.strain, *MAX_STRAIN,
@@ -454,7 +450,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     ):
         yield Check(
             name, f"the drive leaves the camera's {what} open by {{}}", e.sigma.get(key, 0.0), bound,
-            s.usable * bound, f"the drive does not show the camera's {what} well enough", remedy, unit,
+            s.usable * bound, f"the drive does not show the camera's {what} well enough{why}", remedy, unit,
         )  # fmt: skip
 
 

@@ -17,10 +17,9 @@ from small_map import small_map
 from typer.testing import CliRunner
 
 from datagen import pipeline
-from datagen.assemble import AssembledMap
+from datagen.assemble import AssembledMap, scaled_figures
 from datagen.lanes.scale import LaneWidth
 from datagen.pipeline import MapRequest, map_drive
-from datagen.quality.figures import scaled_figures
 from datagen.settings import MapSettings
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings

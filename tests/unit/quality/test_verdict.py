@@ -78,7 +78,6 @@ ROWS = [
     ("min_bend_m", lambda x: {"left_m": 0.1, "right_m": x - 0.1}, S.min_bend_m, None),
     ("min_in_view", lambda x: {"in_view": x}, S.min_in_view, None),
     ("max_closure_heights", lambda x: {"closure_across_heights": x}, S.max_closure_heights, None),
-    ("min_revisits", lambda x: {"revisits": round(x)}, S.min_revisits, S.min_revisits // 2),
     ("max_strain", lambda x: {"strain": x}, *MAX_STRAIN),
     ("max_focal_sigma", lambda x: {"sigma": {"focal": x}}, S.max_focal_sigma, 2.0 * S.max_focal_sigma),
     (
@@ -162,7 +161,6 @@ def test_nothing_is_good_that_nobody_knows():
     assert off(off_3=NAN) == {"max_off": "reject"}
     assert off(open_lane_cm=(31.0, 44.2)) == {"open_cm": "usable"}
     # A drive that shows no place twice rests on what is known of the camera beforehand.
-    assert off(**OPEN) == {"min_revisits": "usable"}
     assert off(**OPEN, sigma={"focal": 0.3})["max_focal_sigma"] == "reject"
     assert off(**OPEN, given_height_cm=17.0) == {} == off(KNOWN, **OPEN)
     none = {"labelled": 0, "off_1": NAN, "off_3": NAN, "metres": 0.0, "left_m": 0.0, "right_m": 0.0}
@@ -203,7 +201,9 @@ def test_the_worst_comes_first_and_of_one_grade_the_cause():
 
 def test_four_laps_are_not_told_to_drive_two():
     short, open_camera = {"labelled": 200, "frames": 210}, {"revisits": 5, "sigma": {"focal": 0.2}}
-    for changes in ({"revisits": 3}, short, open_camera):
+    # How long a lap of a circle is stays open however many are driven.
+    assert "two laps" not in judged(**open_camera, laps=1, alike=True).sentence
+    for changes in (short, open_camera):
         assert "two laps" in judged(**changes, laps=1).sentence, changes
         assert "two laps" not in judged(**changes, laps=4).sentence, changes
 
