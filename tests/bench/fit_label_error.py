@@ -31,7 +31,7 @@ TREES = {"max_iter": 80, "learning_rate": 0.08, "max_leaf_nodes": 12, "min_sampl
 #: Bounds of the probabilities, of errors beyond 1 and 3 cm, whose price is printed.
 TRIED = (
     (1.0, 1.0),
-    (0.5, 0.1),
+    (0.5, 0.02),
     (0.5, 0.05),
     (0.5, 0.03),
     (0.3, 0.05),

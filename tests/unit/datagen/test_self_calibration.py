@@ -216,7 +216,7 @@ def test_a_nudge_changes_one_number_and_comes_back(name):
         ([(90.0, True), (91.0, True)], [80.0, 90.0]),
         ([(90.0, True), (95.0, True), (99.0, True), (110.0, True)], [80.0, 90.0, 95.0, 99.0]),
         # The focal length stays, but the odometry with this camera contradicts the closed loop.
-        ([(81.0, True, 1.5), (81.0, True, 0.2)], [80.0, 81.0]),
+        ([(81.0, True, 2.0), (81.0, True, 0.2)], [80.0, 81.0]),
         ([(80.0, False), (79.0, True)], [80.0, 80.0]),
         ([(80.0, False), (80.0, False), (95.0, True)], [80.0, 80.0, 96.0]),
         ([(90.0, True), (90.0, False)], [80.0, 90.0]),
