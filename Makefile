@@ -10,7 +10,7 @@ PIP_ARGS ?=
 
 BIN := $(VENV)/bin
 # Built by pip where there is a C++ compiler.
-KERNELS := $(wildcard lanenet/perception/*.hpp lanenet/perception/_kernels.cpp lanenet/perception/*/_kernels.cpp lanenet/perception/*/*/_kernels.cpp)
+KERNELS := $(wildcard lanenet/perception/*.hpp lanenet/perception/_kernels.cpp lanenet/perception/*/_kernels.cpp)
 PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt
 # Tests run on this many cores. Each process takes over a gigabyte, hence the bound for large machines.
 TEST_PROCESSES ?= auto

@@ -13,13 +13,16 @@ from lanenet.geometry.lane import N_POINTS, PARABOLA_FROM_POINTS, ROWS_CM, SIDES
 from lanenet.learn.config import NetworkSettings
 from lanenet.learn.trunks import TRUNKS
 from lanenet.perception.edges.raster import MIDDLE, STEPS
-from lanenet.perception.network.compact.network import SIGMA_RANGE_CM, WIDTH_SIGMA
 
 #: Distance of the lane centre A that the paper steers at, [cm]; it is one of the label rows.
 LOOKAHEAD_CM = ROWS_CM[1]
+#: The predicted sigma stays within these, [cm], before it is calibrated. Chosen: from below the best labels'
+#: error to half the window.
+SIGMA_RANGE_CM = (0.05, 50.0)
 #: Centres of the eight Gaussians that encode the lane width, [cm]: from narrow model roads to wide ones, each
-#: 4/3 of the one before.
+#: 4/3 of the one before; and their sigma in log width, about the distance of two neighbours, log(4/3).
 _WIDTHS_CM = (15.0, 20.0, 27.0, 36.0, 48.0, 64.0, 85.0, 114.0)
+WIDTH_SIGMA = 0.25
 _LOG_LOW, _LOG_HIGH = (math.log(v) for v in SIGMA_RANGE_CM)
 
 

@@ -20,7 +20,6 @@ from lanenet.onboard.cameras import jpeg
 from lanenet.perception.edges import compiled
 from lanenet.perception.edges.road import RangeSettings, RoadTable
 from lanenet.perception.network import compiled as network_compiled
-from lanenet.perception.network.compact import network as compact
 
 State = Literal["ok", "note", "problem"]
 
@@ -209,13 +208,10 @@ def _jpeg() -> Check:
 
 
 def _kernels() -> Check:
-    if not (compiled.is_here() and network_compiled.is_here() and compact.is_installed()):
+    if not (compiled.is_here() and network_compiled.is_here()):
         text = "not here: the same answers, slower; install g++ and the headers of Python, then lanenet again"
         return Check("compiled loops", "note", text)
-    if not compact.is_here():
-        text = "for edges and lines; for networks only with AVX2 and FMA: onnxruntime runs them, slower"
-        return Check("compiled loops", "note", text)
-    return Check("compiled loops", "ok", "for edges, lines and networks")
+    return Check("compiled loops", "ok", "for edges and lines")
 
 
 def _onnxruntime() -> Check:

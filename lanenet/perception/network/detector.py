@@ -24,13 +24,15 @@ from lanenet.geometry.lane import (
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor, RoadEdges
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
-from lanenet.perception.network.compact.network import ANSWERS, open_network
-from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta
+from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
 from lanenet.perception.network.tracking.camera_view import CameraView
 from lanenet.perception.network.tracking.lane_belief import Keep
 from lanenet.perception.network.tracking.tracker import LaneTracker
 
 log = logging.getLogger(__name__)
+
+#: What the network is asked for.
+_ANSWERS = ("points_cm", "sigma_cm", "presence")
 
 #: A frame with more edges than this share of its road pixels is noise. Chosen: above the lane filter's 0.1,
 #: since a network copes with more clutter.
@@ -89,7 +91,7 @@ class NetworkDetector:
             camera: The car's camera. Edges are found as the model's training images had them.
             any_camera: Accept a camera that the model was not trained with. Bird's-eye rasters of two
                 calibrated cameras look alike, but not where one of them sees more.
-            threads: Threads of onnxruntime, for a network that it runs.
+            threads: Threads of onnxruntime.
             mask: Nonzero on the car itself: edges there are left out, beside what the model's own settings
                 leave out.
             lane_width_cm: The lane's width if it is known; a network with an input for it gets it. None takes
@@ -101,7 +103,7 @@ class NetworkDetector:
             CalibrationError: If the mask's size is not the camera's.
             ModelMismatchError: If the file is not a model of this format, or was made for another camera.
         """
-        self._session, self.meta = open_network(model_path, threads)
+        self._session, self.meta = open_model(model_path, threads, frames=1)
         if not any_camera:
             _check_camera(self.meta, camera, model_path)
         widths_cm = [] if lane_width_cm is None else [lane_width_cm]
@@ -169,7 +171,7 @@ class NetworkDetector:
         """Run the network on the raster, with the lane's width as soon as it is known."""
         if self.meta.takes_width:
             self._feed[WIDTH_NAME] = np.array([self.memory.width_cm or 0.0], np.float32)
-        found = self._session.run(ANSWERS, self._feed)
+        found = self._session.run(_ANSWERS, self._feed)
         points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
         return points_cm, sigma_cm, presence
 

@@ -403,27 +403,23 @@ def open_model(
         ModelMismatchError: If the file is missing, was damaged or is not an ONNX file, its description is of
             another format or does not fit its own inputs and outputs, or it fails its self-test.
     """
-    return check_model(*read_model(path), threads, frames)
-
-
-def read_model(path: Path) -> tuple[bytes, str]:
-    """Return the bytes of a model file, or of that in a checkpoint folder, and its name for errors.
-
-    Raises:
-        ModelMismatchError: If it is missing, or was damaged.
-    """
     path = find_model(path)
-    data = read_bytes(path, ModelMismatchError, _MAX_MODEL)
-    _check_seal(data, str(path))
-    return data, str(path)
+    where, data = str(path), read_bytes(path, ModelMismatchError, _MAX_MODEL)
+    _check_seal(data, where)
+    session = _new_session(data, where, threads, frames)
+    # Property texts that are no UTF-8.
+    with parsing(f"{where}: properties", ModelMismatchError):
+        properties = session.get_modelmeta().custom_metadata_map
+    meta = ModelMeta.from_properties(properties, where)
+    _check_graph(session, meta, where)
+    if SELF_TEST_NAME not in properties:
+        raise ModelMismatchError(f"{where}: property {SELF_TEST_NAME!r} is missing; {_REMEDY}")
+    shape = meta.planes, meta.window.rows, meta.window.columns
+    _run_self_test(session, properties[SELF_TEST_NAME], shape, where)
+    return session, meta
 
 
-def new_session(data: bytes, where: str, threads: int, frames: int | None) -> onnxruntime.InferenceSession:
-    """Open an ONNX file's bytes; the arguments are those of :func:`open_model`.
-
-    Raises:
-        ModelMismatchError: If onnxruntime does not take it.
-    """
+def _new_session(data: bytes, where: str, threads: int, frames: int | None) -> onnxruntime.InferenceSession:
     # A command that runs no network starts without it.
     import onnxruntime
 
@@ -441,15 +437,8 @@ def new_session(data: bytes, where: str, threads: int, frames: int | None) -> on
         raise ModelMismatchError(f"{where}: cannot be opened as an ONNX model ({reason})") from None
 
 
-def check_model(
-    data: bytes, where: str, threads: int, frames: int | None
-) -> tuple[onnxruntime.InferenceSession, ModelMeta]:
-    """Do :func:`open_model` for what :func:`read_model` read."""
-    session = new_session(data, where, threads, frames)
-    # Property texts that are no UTF-8.
-    with parsing(f"{where}: properties", ModelMismatchError):
-        properties = session.get_modelmeta().custom_metadata_map
-    meta = ModelMeta.from_properties(properties, where)
+def _check_graph(session: onnxruntime.InferenceSession, meta: ModelMeta, where: str) -> None:
+    """Refuse a model whose inputs and outputs are not those of its description."""
     inputs = {i.name: (i.type, list(i.shape[1:])) for i in session.get_inputs()}
     shape = meta.planes, meta.window.rows, meta.window.columns
     expected = {INPUT_NAME: ("tensor(uint8)", [*shape])}
@@ -464,10 +453,6 @@ def check_model(
     outputs = [o.name for o in session.get_outputs()]
     if not set(OUTPUT_NAMES) <= set(outputs):
         raise ModelMismatchError(f"{where}: outputs {outputs}, expected {list(OUTPUT_NAMES)}")
-    if SELF_TEST_NAME not in properties:
-        raise ModelMismatchError(f"{where}: property {SELF_TEST_NAME!r} is missing; {_REMEDY}")
-    _run_self_test(session, properties[SELF_TEST_NAME], shape, where)
-    return session, meta
 
 
 def read_model_meta(path: Path) -> ModelMeta:

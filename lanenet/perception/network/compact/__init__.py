@@ -1,1 +1,0 @@
-"""The compact networks without onnxruntime, in compiled loops."""
