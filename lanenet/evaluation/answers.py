@@ -82,7 +82,7 @@ def answer_frames(
         brightness,
         plain,
     )
-    for seen in run_detectors(frames, detectors):
+    for seen in run_detectors(frames, detectors, frames.motion):
         i, image = seen.index, seen.image
         assert image is not None
         # Every fourth pixel is enough for a mean.

@@ -15,13 +15,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lanenet.data.detections import DetectionTable, check_table_path
+from lanenet.data.drives.motion import Motion, commanded_motion
 from lanenet.data.drives.sources import Source
 from lanenet.data.files import atomic_file, check_destination
 from lanenet.errors import CalibrationError, DriveFormatError, UnreadableFrameError
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import lane_width_cm
 from lanenet.perception.draw import draw_estimate
-from lanenet.perception.estimate import Detector, LaneEstimate
+from lanenet.perception.estimate import Detector, LaneEstimate, TakesMotion
 from lanenet.perception.image_lane import ImageLane
 
 if TYPE_CHECKING:
@@ -58,7 +59,11 @@ class SeenFrame:
 
 
 def run_detectors(
-    frames: Source | LabelledFrames, detectors: Mapping[str, Detector], *, skip_unreadable: bool = False
+    frames: Source | LabelledFrames,
+    detectors: Mapping[str, Detector],
+    motion: Motion | None = None,
+    *,
+    skip_unreadable: bool = False,
 ) -> Iterator[SeenFrame]:
     """Run detectors over frames in order; each image is read once.
 
@@ -67,6 +72,7 @@ def run_detectors(
     Args:
         frames: The source.
         detectors: By name.
+        motion: Motion of the car; told to the detectors that ask for it, as in the car's loop.
         skip_unreadable: Yield a frame that cannot be read with empty estimates.
 
     Raises:
@@ -77,6 +83,10 @@ def run_detectors(
         if i == 0 or frames.starts[i]:
             for detector in detectors.values():
                 detector.reset()
+        elif motion is not None and np.isfinite(motion.turn_rad[i]):
+            for detector in detectors.values():
+                if isinstance(detector, TakesMotion):
+                    detector.moved(float(motion.travel_cm[i]), float(motion.turn_rad[i]), motion.wheelbase_cm)
         try:
             image = frames.image(i)
         except DriveFormatError as error:
@@ -166,7 +176,10 @@ def run_detector(
     problems: list[str] = []
     widths_cm: list[float] = []
     complete = steered = 0
-    running = run_detectors(source, {ONE: detector}, skip_unreadable=skip_unreadable)
+    motion = None
+    if camera is not None and source.commands is not None:
+        motion = commanded_motion(source.commands, source.t_s, source.starts, camera.wheelbase_cm)
+    running = run_detectors(source, {ONE: detector}, motion, skip_unreadable=skip_unreadable)
     with ExitStack() as stack:
         writer = _AnnotatedVideo(stack, video, camera, source.rate_hz) if video is not None else None
         for seen in running:

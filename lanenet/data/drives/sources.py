@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from lanenet.data.drives import (
     PHOTO_ENDINGS,
+    Commands,
     drive_above,
     find_format,
     formats_text,
@@ -48,6 +49,7 @@ class Source:
         camera: Camera that the frames name.
         lane_width_cm: Lane width that they name.
         problems: What is wrong with the source, a sentence each.
+        commands: What was commanded; None of photos.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Source:
     camera: Camera | None = None
     lane_width_cm: float | None = None
     problems: tuple[str, ...] = ()
+    commands: Commands | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -86,6 +89,7 @@ class Source:
             frames=self.frames[rows],
             t_s=self.t_s[rows],
             starts=self.starts[rows],
+            commands=None if self.commands is None else self.commands.subset(rows),
             image=lambda i: whole(start + i),
         )
 
@@ -165,6 +169,7 @@ def _recorded(path: Path) -> Source:
         drive.camera,
         drive.lane_width_cm,
         drive.problems,
+        drive.commands,
     )
 
 

@@ -18,6 +18,7 @@ from lanenet.config import check_settings, read_yaml
 from lanenet.data.drives import Drive, open_drive
 from lanenet.data.drives.content import other_images
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
+from lanenet.data.drives.motion import Motion, commanded_motion, motion_between
 from lanenet.data.label_set import Source
 from lanenet.data.maps.folder import SETTINGS_NAME, DriveMap, read_map
 from lanenet.data.maps.frame_lines import FrameLines, lines_of_frame, parallel_line
@@ -338,6 +339,7 @@ class LabelledFrames:
         all_cm: As ``points_cm``, with the points that a simulator knows although they are no labels; None
             where the labels are all that is known.
         t_s: Time of each frame; None if unknown.
+        motion: Motion of the car, commanded where that was recorded, else by its poses; None if unknown.
     """
 
     name: str
@@ -352,6 +354,7 @@ class LabelledFrames:
     image: Callable[[int], UInt8[np.ndarray, "h w 3"]] = field(repr=False)
     all_cm: Float[np.ndarray, "n 6"] | None = None
     t_s: Float[np.ndarray, "n"] | None = None
+    motion: Motion | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -372,6 +375,7 @@ class LabelledFrames:
             points_cm=self.points_cm[rows],
             all_cm=None if self.all_cm is None else self.all_cm[rows],
             t_s=None if self.t_s is None else self.t_s[rows],
+            motion=None if self.motion is None else self.motion.only(rows),
             image=partial(_image_at, self.image, rows),
         )
 
@@ -410,6 +414,7 @@ def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> Label
     starts = drive.breaks.copy()
     starts[0] = True
     all_cm = np.stack([truth[name] for name in POINT_NAMES], axis=1)
+    poses = np.stack([truth[name] for name in ("x_cm", "y_cm", "heading_rad")], axis=1)
     return LabelledFrames(
         name=str(path),
         reference="truth",
@@ -423,6 +428,7 @@ def read_truth_frames(path: Path, window: BirdseyeWindow | None = None) -> Label
         image=drive.image,
         all_cm=all_cm,
         t_s=drive.t_s,
+        motion=_motion(drive, poses, starts, drive.camera.wheelbase_cm),
     )
 
 
@@ -456,4 +462,13 @@ def read_map_frames(
         points_cm=label_frames(mapped, window).points_cm,
         image=partial(_image_at, drive.image, rows),
         t_s=drive_map.t_s,
+        motion=_motion(drive.subset(rows), drive_map.poses, mapped.starts, drive_map.camera.wheelbase_cm),
     )
+
+
+def _motion(
+    drive: Drive, poses: Float[np.ndarray, "n 3"], starts: Bool[np.ndarray, "n"], wheelbase_cm: float
+) -> Motion:
+    """Return the motion as it was commanded, or by the poses where that was not recorded."""
+    commanded = commanded_motion(drive.commands, drive.t_s, starts, wheelbase_cm)
+    return motion_between(poses, starts, wheelbase_cm) if commanded is None else commanded

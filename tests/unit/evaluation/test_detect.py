@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from detections import read_detections
 
+from lanenet.data.drives import Commands
 from lanenet.data.drives.sources import Source
 from lanenet.errors import CalibrationError, DriveFormatError, LabelFormatError
 from lanenet.evaluation.answers import answer_edges
@@ -51,6 +52,24 @@ def source_of(values: list[int | None], breaks: list[int] | None = None) -> Sour
     starts = np.zeros(n, bool)
     starts[[0, *(breaks or [])]] = True
     return Source("test drive", 10 + np.arange(n), 0.05 * np.arange(n), starts, 20.0, image)
+
+
+class Following(Scripted):
+    """Notes how the car moved as well."""
+
+    def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
+        self.log.append(f"{travel_cm:.1f} cm, {turn_rad:.2f} rad")
+        assert wheelbase_cm == CAMERA.wheelbase_cm
+
+
+def test_a_detector_is_told_how_the_car_was_commanded(tmp_path: Path) -> None:
+    commands = Commands(speed_cm_s=np.array([20.0, 40.0, np.nan, 40.0, 40.0]), steering_rad=np.zeros(5))
+    source = dataclasses.replace(source_of([1, 2, 3, 4, 5], breaks=[4]), commands=commands)
+    detector = Following()
+    run_detector(source, detector, CAMERA, tmp_path / "l.csv")
+    assert detector.log == [
+        "reset", 1, "1.0 cm, 0.00 rad", 2, "2.0 cm, 0.00 rad", 3, 4, "reset", 5,
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])
