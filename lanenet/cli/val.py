@@ -183,12 +183,12 @@ def show(
         names: The detectors of the one table; None for all.
         show_all: Print all tables.
     """
-    from lanenet.evaluation.tables import lay_out, main_table
+    from lanenet.evaluation.tables import lay_out, main_tables
     from lanenet.evaluation.verdict import verdict_sentence
 
     console.say(f"verdict: {verdict_sentence(comparison, seen, where)}")
     chosen = list(comparison.tables) if names is None else names
-    for table in lay_out(comparison) if show_all else [main_table(comparison, chosen)]:
+    for table in lay_out(comparison) if show_all else main_tables(comparison, chosen):
         console.show_rich(table.as_rich())
 
 

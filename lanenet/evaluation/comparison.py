@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lanenet.errors import LabelFormatError
+from lanenet.evaluation.decisions import Decisions, decide
 from lanenet.evaluation.errors import (
     GROUPS,
     Breakdown,
@@ -137,6 +138,7 @@ class Comparison:
         shared_rows: As ``shared``, by the group of rows (``SHARED_ROWS``).
         whole: By detector, the errors that the labels leave out; empty where they leave nothing out.
         plain: By detector, what it says about markings in plain sight; empty where no frame shows them so.
+        decisions: By detector, its wrong decisions, and the errors of the others.
         sources: The errors by source.
         errors_cm: Absolute errors by detector, a row per frame; NaN without a label or an answer.
         breakdown: Where the errors come from.
@@ -148,6 +150,7 @@ class Comparison:
     shared_rows: dict[str, dict[str, SharedErrors]]
     whole: dict[str, WholeTruth]
     plain: dict[str, PlainSight]
+    decisions: dict[str, Decisions]
     sources: tuple[SourceErrors, ...]
     errors_cm: dict[str, Float[np.ndarray, "n 6"]]
     breakdown: Breakdown
@@ -173,6 +176,7 @@ class Comparison:
                 },
                 "masked": self.whole[name].masked.as_dict() if name in self.whole else None,
                 "plain_sight": vars(self.plain[name]) if name in self.plain else None,
+                "decisions": self.decisions[name].as_dict(),
                 "all_known": self.whole[name].all.as_dict() if name in self.whole else None,
                 **self.breakdown.of(name),
             }
@@ -319,6 +323,7 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
         shared_rows=shared_rows,
         whole=_whole_truth(sources, truth, answers),
         plain={name: count_off(answer, truth, plain) for name, answer in answers.items() if plain.any()},
+        decisions=_decisions(sources, truth, answers),
         sources=tuple(_source_errors(source) for source in sources),
         errors_cm=errors,
         breakdown=_break_down(sources, names, truth, errors),
@@ -328,6 +333,17 @@ def compare_detectors(sources: Sequence[SourceAnswers]) -> Comparison:
 def _columns_of(rows: Sequence[int]) -> list[int]:
     """Columns of both lines' points on some of the label rows."""
     return [side * len(ROWS_CM) + row for side in range(len(SIDES)) for row in rows]
+
+
+def _decisions(
+    sources: Sequence[SourceAnswers],
+    truth_cm: Float[np.ndarray, "n 6"],
+    answers_cm: Mapping[str, Float[np.ndarray, "n 6"]],
+) -> dict[str, Decisions]:
+    frames = [len(source.truth_cm) for source in sources]
+    starts, cuts = np.cumsum(frames)[:-1], bootstrap_segments(frames)[0]
+    sigma_cm = {name: _joined(sources, [s.sigma_cm.get(name) for s in sources], 6) for name in answers_cm}
+    return {name: decide(own, truth_cm, sigma_cm[name], starts, cuts) for name, own in answers_cm.items()}
 
 
 def _whole_truth(

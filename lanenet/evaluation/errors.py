@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -264,14 +265,31 @@ def rmse_interval_cm(
     Returns:
         Lower and upper end, [cm]; None for fewer than three drives with an answer.
     """
-    squares = np.array([np.nansum(e * e) for e in errors_cm])
-    counts = np.array([np.isfinite(e).sum() for e in errors_cm])
-    squares, counts = squares[counts > 0], counts[counts > 0]
-    n = len(counts)
+    squares = [float(np.nansum(e * e)) for e in errors_cm]
+    ends = share_interval(squares, [float(np.isfinite(e).sum()) for e in errors_cm], rng)
+    return None if ends is None else (math.sqrt(ends[0]), math.sqrt(ends[1]))
+
+
+def share_interval(
+    parts: Sequence[float], wholes: Sequence[float], rng: np.random.Generator
+) -> tuple[float, float] | None:
+    """Return the 95 % interval of a ratio of sums over drives, by bootstrap over the drives.
+
+    Args:
+        parts: Numerator of each drive or segment.
+        wholes: Denominator; those of 0 do not count.
+        rng: Source of randomness.
+
+    Returns:
+        Lower and upper end; None for fewer than three drives that count.
+    """
+    part, whole = np.asarray(parts), np.asarray(wholes)
+    part, whole = part[whole > 0.0], whole[whole > 0.0]
+    n = len(whole)
     if n < _FEWEST:
         return None
     times = rng.multinomial(n, np.full(n, 1.0 / n), _RESAMPLES)
-    low, high = np.percentile(np.sqrt((times @ squares) / (times @ counts)), [2.5, 97.5])
+    low, high = np.percentile((times @ part) / (times @ whole), [2.5, 97.5])
     return float(low), float(high)
 
 

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from lanenet.errors import printable
 from lanenet.evaluation.comparison import Comparison
+from lanenet.evaluation.decisions import SURELY_CM
 from lanenet.evaluation.errors import GROUPS, INTERVALS, ErrorStats
 from lanenet.evaluation.plain_sight import OFF_CM
 from lanenet.geometry.lane import POINT_NAMES, ROWS_CM, SIDES
@@ -69,7 +70,7 @@ class TextTable:
 
 def lay_out(comparison: Comparison) -> list[TextTable]:
     """Lay out a comparison: by point, with masked ones, shared points, by source and condition, sigma."""
-    tables = [_by_point(comparison)]
+    tables = main_tables(comparison, list(comparison.tables))
     if comparison.whole:
         tables.append(_with_masked(comparison))
     if comparison.shared:
@@ -88,9 +89,9 @@ def lay_out(comparison: Comparison) -> list[TextTable]:
     return tables
 
 
-def main_table(comparison: Comparison, names: Sequence[str]) -> TextTable:
-    """Lay out the errors by point of some of the detectors."""
-    return _by_point(comparison, names)
+def main_tables(comparison: Comparison, names: Sequence[str]) -> list[TextTable]:
+    """Lay out the errors by point and the wrong decisions of some of the detectors."""
+    return [_by_point(comparison, names), _decided(comparison, names)]
 
 
 def as_markdown(comparison: Comparison) -> str:
@@ -98,10 +99,9 @@ def as_markdown(comparison: Comparison) -> str:
     return "\n".join(table.as_markdown() for table in lay_out(comparison))
 
 
-def _by_point(comparison: Comparison, names: Sequence[str] | None = None) -> TextTable:
+def _by_point(comparison: Comparison, names: Sequence[str]) -> TextTable:
     lines = []
-    chosen = list(comparison.tables) if names is None else names
-    for name in chosen:
+    for name in names:
         table = comparison.tables[name]
         groups = [table.groups[group] for group in ("all", *POINT_NAMES)]
         values = zip(*(_values(stats) for stats in groups), strict=True)
@@ -117,7 +117,7 @@ def _by_point(comparison: Comparison, names: Sequence[str] | None = None) -> Tex
     intervals = [
         f"{name} {show_cm(ends[0])} to {show_cm(ends[1])}"
         for name, ends in comparison.breakdown.interval_cm.items()
-        if ends is not None and name in chosen
+        if ends is not None and name in names
     ]
     if intervals:
         over = comparison.breakdown.interval_over
@@ -129,6 +129,33 @@ def _by_point(comparison: Comparison, names: Sequence[str] | None = None) -> Tex
         note=note,
         texts=2,
         grouped=True,
+    )
+
+
+def _decided(comparison: Comparison, names: Sequence[str]) -> TextTable:
+    lines, intervals = [], []
+    for name in names:
+        found, cells = comparison.decisions[name], list[str]()
+        for kind, wrong in (("wrong lane", found.wrong_lane), ("surely wrong", found.surely_wrong)):
+            share = wrong.frames / found.frames if found.frames else math.nan
+            cells += [f"{1000.0 * share:.1f}" if found.frames else "-", str(wrong.events)]
+            if wrong.interval is not None and wrong.frames:
+                low, high = (1000.0 * end for end in wrong.interval)
+                intervals.append(f"{name}, {kind}: {low:.1f} to {high:.1f}")
+        errors = map(show_cm, (found.rmse_cm, found.p95_cm, found.p99_cm))
+        lines.append([name, str(found.frames), *cells, *errors])
+    note = (
+        "per 1000 frames, and as events (runs of frames). Wrong lane: the centre is off by more than half of "
+        f"the lane's width; surely wrong: a point by more than three of its sigmas and {SURELY_CM:.0f} cm. "
+        "The errors, in cm, are those of the frames that are not in a wrong lane"
+    )
+    if intervals:
+        note += f". 95 % intervals over {comparison.breakdown.interval_over}: {'; '.join(intervals)}"
+    return TextTable(
+        title="Wrong decisions, and errors where the lane is right",
+        header=["detector", "frames", "wrong lane", "events", "surely wrong", "events", "RMSE", "p95", "p99"],
+        lines=lines,
+        note=note,
     )
 
 

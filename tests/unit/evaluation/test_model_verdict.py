@@ -13,7 +13,7 @@ from lanenet.data.maps.folder import write_map
 from lanenet.data.maps.label_errors import LabelErrors
 from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.evaluation.comparison import Comparison, SeenSource, SourceAnswers, compare_detectors
-from lanenet.evaluation.tables import lay_out, main_table
+from lanenet.evaluation.tables import lay_out, main_tables
 from lanenet.evaluation.verdict import verdict_sentence
 from lanenet.perception.edges.road import PerceptionSettings
 
@@ -70,7 +70,7 @@ def test_a_model_that_answers_little_or_is_often_far_off_is_not_fit_to_drive_wit
 
 def test_one_table_holds_the_detectors_that_were_asked_for():
     comparison, _ = compared(TRUTH + 0.6, "m")
-    shown = main_table(comparison, ["network"])
+    shown, _ = main_tables(comparison, ["network"])
     assert {line[0] for line in shown.lines} == {"network", ""}
     assert {line[0] for line in lay_out(comparison)[0].lines} == {"network", "painter", ""}
     assert "painter" not in shown.note
