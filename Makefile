@@ -23,7 +23,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype -rs --fail-on-skips all \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train general install env test test-data test-slow test-base-install chain traps fit-labels left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-data test-slow test-base-install chain traps ablation fit-labels left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then a network from nothing by $(CONFIG), into checkpoints/$(NAME)/"
@@ -34,6 +34,7 @@ help:
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  the wheel and the source archive in empty environments, with every Python there is"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of all but one config; two processes"
+	@echo "make ablation     what parts of the network's tracker are worth, on 500 simulated drives (goes on where it stopped)"
 	@echo "make traps        maps of drives that are hard to map, of one KIND (goes on where it stopped), and broken maps"
 	@echo "make fit-labels   the model of label errors, from drives of four kinds with their truth; hours"
 	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
@@ -106,6 +107,10 @@ KIND ?= roads
 traps: $(VENV)/.stamp-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --kind $(KIND) --folder runs/traps/$(KIND) $(TRAPS)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps/$(KIND)
+
+# 500 drives take 20 minutes on one core; goes on where it stopped. ABLATION adds arguments, such as --processes 2.
+ablation: $(VENV)/.stamp-dev
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_ablation.py --folder runs/ablation $(ABLATION)
 
 # Goes on where it stopped; FIT_KINDS and TRAPS narrow it.
 FIT_KINDS ?= roads tiles office mats
