@@ -241,12 +241,14 @@ def _close(found: Camera, start: Camera) -> bool:
 def prior_strain(camera: Camera, prior: Camera, priors: BundleSettings) -> float:
     """Distance of a camera's principal point and roll from their priors, in sigmas of ordinary cameras.
 
-    Every ordinary camera meets these priors: far from them, the images show more than a flat road.
+    Every ordinary camera meets these priors: far from them, the images show more than a flat road. A search
+    that began with an unusual camera may come back to a level one with its axis in the middle.
     """
     centre_px = max(priors.centre_px, _CENTRE_PX) * camera.width / _REFERENCE_WIDTH
-    off_px = np.abs(camera.K[:2, 2] - prior.K[:2, 2]).max()
-    roll_rad = abs(camera.mounting.roll_rad - prior.mounting.roll_rad)
-    return max(float(off_px) / centre_px, roll_rad / max(priors.roll, _LEVEL_RAD))
+    middle_px = 0.5 * (np.array([camera.width, camera.height]) - 1.0)
+    off_px = min(float(np.abs(camera.K[:2, 2] - at_px).max()) for at_px in (prior.K[:2, 2], middle_px))
+    roll_rad = min(abs(camera.mounting.roll_rad - level_rad) for level_rad in (prior.mounting.roll_rad, 0.0))
+    return max(off_px / centre_px, roll_rad / max(priors.roll, _LEVEL_RAD))
 
 
 def honest_sigma(
