@@ -478,8 +478,8 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     if (asked := _other_width(e, s)) is not None:
         yield asked
     made = (
-        f"with a lane width of {e.given_lane_cm:.4g} cm, the camera would be {e.height_cm:.0f} cm high and the "
-        f"tape {e.tape_cm:.1f} cm wide, which cannot be"
+        f"with a lane width of {e.given_lane_cm:.4g} cm, the camera would be {e.height_cm:.0f} cm high and "
+        f"the tape {e.tape_cm:.1f} cm wide, which cannot be"
     )
     for bound, what, value, _, _, (least, most) in lengths:
         end = least if value < least else most
@@ -518,8 +518,8 @@ def _other_width(e: MapEvidence, s: VerdictSettings) -> Check | None:
         "usual size", f"the {made}, most cars have what {times} the lane width gives: off by {{}}", 1.0, 0.0,
         None,
         f"is {e.given_lane_cm:.4g} cm the width {what}? It makes the {made}; --lane-width "
-        f"{share * e.given_lane_cm:.4g} would make them {share * e.height_cm:.1f} and {share * e.tape_cm:.1f} "
-        "cm, as on most cars",
+        f"{share * e.given_lane_cm:.4g} would make them {share * e.height_cm:.1f} and "
+        f"{share * e.tape_cm:.1f} cm, as on most cars",
         "measure the lane between the middles of its two lines; if it is right, give the width of the tape "
         "or the height of the camera as well (--tape-width, --camera-height)",
     )  # fmt: skip
@@ -564,7 +564,7 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
     if (e.found_lane_cm, e.given_height_cm, e.given_tape_cm, _other_width(e, s)) == (None,) * 4:
         yield (
             f"is it right that the camera is {e.height_cm:.1f} cm high and the tape {e.tape_cm:.1f} cm wide? "
-            f"Both follow from the lane width of {e.given_lane_cm:.4g} cm, which no check here can show to be "
-            "wrong. Measure one of them with a ruler. If it differs, the lane width is wrong by the same "
+            f"Both follow from the lane width of {e.given_lane_cm:.4g} cm, which no check here can show to "
+            "be wrong. Measure one of them with a ruler. If it differs, the lane width is wrong by the same "
             "factor; --camera-height or --tape-width checks it for you"
         )
