@@ -100,9 +100,9 @@ _STAYS_RAD, _MOST_REPEATED = 0.04, 11
 #: length of a short straight. Measured, the least of a drive: 0.95 on circles, 0.8 where a ring was closed
 #: falsely, 0.63 to 0.67 on rings with corners.
 _BESIDE_HEIGHTS, _TELLS = (4.0, 8.0, 12.0), 0.75
-#: Ratio of the misfits of another way around and of the best one, from which on the best is sure. Measured on
-#: rings of tiles: 1.5 and more beside the true one, 1.03 to 1.14 where both were false.
-_UNDECIDED = 1.25
+#: Ratio of the misfits of another way around and of the best one, up to which the other explains the images
+#: as well. Measured on rings of tiles: 1.5 and more beside the true one, 1.03 to 1.14 where both were false.
+_NEAR = 1.25
 #: Laps that differ in length by more than this logarithm, or in their turn, [rad], lead along other ways.
 #: Chosen: less than a tile of a ring of ten, and less than half a corner.
 _OTHER_LAP, _OTHER_TURN_RAD = 0.1, 0.25 * np.pi
@@ -125,8 +125,7 @@ class SolvedSegment:
         bundle: The adjustment.
         part: Number of the part that each frame belongs to; between parts lies a long gap of the recording.
         keys: Keyframes by which a slow car was tracked; None where every frame is one.
-        decided: Whether revisits tell how long a lap is: beside them places look otherwise, and no other way
-            around explains the images nearly as well, with another camera.
+        decided: Whether revisits tell how long a lap is: beside them places look otherwise.
         missed: Heading that the open loop misses in a lap, in sigmas of one with a known camera; 0 without a
             revisit within a part.
     """
@@ -147,7 +146,7 @@ class SolvedSegment:
 
     @property
     def ties_camera(self) -> bool:
-        """Whether a loop was closed, and in one way alone: that determines the lens."""
+        """Whether a loop was closed that tells how long a lap is: that determines the lens."""
         return bool(self.revisits) and self.decided
 
     @property
@@ -341,7 +340,7 @@ class _Closure:
     """Loops that were closed with some revisits, the adjusted map, and the road that its camera sees.
 
     Attributes:
-        decided: Whether its revisits tell places, and no other way around explains the images nearly as well.
+        decided: Whether its revisits tell places.
     """
 
     revisits: list[Revisit]
@@ -602,12 +601,21 @@ class _DenseSegment:
             for one, misfit in zip(rivals, agree, strict=True)
         ]
         best = int(np.argmin(costs))
-        focal, sigma = (
-            np.log([one.bundle.camera.K[0, 0] for one in rivals]),
-            rivals[best].bundle.sigma["focal"],
-        )
-        other = (np.array(agree) < _UNDECIDED * agree[best]) & (np.abs(focal - focal[best]) > sigma)
-        return replace(rivals[best], decided=not other.any() and self.tells_places(rivals[best], opened))
+        chosen = rivals[best].bundle
+        near = [
+            one.bundle for one, misfit in zip(rivals, agree, strict=True) if misfit <= _NEAR * agree[best]
+        ]
+        apart = {
+            "focal": max(abs(float(np.log(one.camera.K[0, 0] / chosen.camera.K[0, 0]))) for one in near),
+            "pitch": max(
+                abs(one.camera.mounting.pitch_down_rad - chosen.camera.mounting.pitch_down_rad)
+                for one in near
+            ),
+        }
+        # The lens is known no better than those agree that explain the images as well.
+        spanning = chosen.sigma | {name: max(chosen.sigma[name], most) for name, most in apart.items()}
+        closure = replace(rivals[best], bundle=replace(chosen, sigma=spanning))
+        return replace(closure, decided=self.tells_places(closure, opened))
 
     def tells_places(self, closure: _Closure, opened: BundleResult) -> bool:
         """Whether a later visit matches the earlier one better than places beside that.

@@ -115,7 +115,7 @@ class FoundCamera:
 
     @property
     def closed(self) -> bool:
-        """Whether a loop was closed, and in one way alone."""
+        """Whether a loop was closed that tells how long a lap is."""
         return self.solved.ties_camera
 
     @property
