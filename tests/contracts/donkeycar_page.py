@@ -91,6 +91,8 @@ def main(car: Path, out: Path) -> None:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     words, environment = [sys.executable, "manage.py", "drive"], os.environ | {"WEB_CONTROL_PORT": str(port)}
+    # A shell in the background lets its children ignore it, and the vehicle would never end.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with open(car / "log.txt", "w") as log:
         vehicle = subprocess.Popen(words, cwd=car, env=environment, stdout=log, stderr=log)
         try:
