@@ -68,10 +68,11 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
     drive, drive_map, free_cm = prepared.drive, assembled.drive_map, assembled.free_lane_cm
     notes = map_notes(drive_map, assembled.segments, len(drive), free_cm is not None)
     mapped = MappedDrive(drive_map, drive, assembled.rows, prepared.settings.perception)
-    # As they were traced: what is withheld of a false line is what would tell that it is one.
-    check_lines_seen(held_out_residuals(mapped), drive, drive_map.meta.lane_width_cm, free_cm)
+    # What is withheld of a false line is what would tell that it is one.
+    traced = held_out_residuals(mapped)
     mapped, quality = compare_with_frames(mapped, camera_figures)
     drive_map = mapped.drive_map
+    check_lines_seen(traced, quality.held_out, drive, drive_map.meta.lane_width_cm, free_cm)
     request = prepared.request
     figures = quality.figures(drive_map) | {
         "segments_mapped": assembled.segments,
@@ -116,12 +117,13 @@ def _sections(wrong: Sequence[WrongSection], segment: int, index: int) -> Float[
 
 
 def check_lines_seen(
-    held_out: Residuals, drive: Drive, lane_width_cm: float, free_lane_cm: float | None
+    traced: Residuals, held_out: Residuals, drive: Drive, lane_width_cm: float, free_lane_cm: float | None
 ) -> None:
     """Refuse lines that held-out frames do not show: clutter along the path.
 
     Args:
-        held_out: Residuals of the map's held-out frames, nothing withheld of the lines.
+        traced: Residuals of the map's held-out frames, nothing withheld of the lines.
+        held_out: The same without what is withheld.
         drive: The drive.
         lane_width_cm: The given lane width.
         free_lane_cm: Lane width found without the given one, if it fits better; else None.
@@ -136,12 +138,12 @@ def check_lines_seen(
             f"{drive.path}: no lane: held-out frames show an edge along {100.0 * share:.0f} % of the "
             f"borders of its lines, expected {100.0 * _LEAST_COVERAGE:.0f} % at least"
         )
-    lines = {side: (coverage(own), robust_sd(own)) for side, own in zip(SIDES, held_out[:2], strict=True)}
+    lines = {side: (coverage(own), robust_sd(own)) for side, own in zip(SIDES, traced[:2], strict=True)}
     by_chance = _BY_CHANCE * coverage(held_out.chance)
     clutter = [
         side
-        for side, (met, sd_px) in lines.items()
-        if met < _CLUTTER_COVERAGE and (sd_px > _CLUTTER_PX or met < by_chance)
+        for (side, (met, sd_px)), kept in zip(lines.items(), held_out[:2], strict=True)
+        if met < _CLUTTER_COVERAGE and (sd_px > _CLUTTER_PX or coverage(kept) < by_chance)
     ]
     if not clutter:
         return

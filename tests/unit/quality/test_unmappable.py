@@ -214,34 +214,50 @@ def border(met: float, spread_px: float, seed: int) -> np.ndarray:
     return np.where(rng.random(n) < met, rng.uniform(-spread_px, spread_px, n), np.nan)
 
 
+def seen(residuals: Residuals, *args) -> None:
+    """Nothing is withheld."""
+    check_lines_seen(residuals, residuals, *args)
+
+
 GOOD, NONE = border(0.97, 0.3, 0), np.full(10, np.nan)
 
 
 def test_a_line_that_meets_edges_by_chance_is_none(both_lines):
     drive = open_drive(both_lines)
-    check_lines_seen(Residuals(GOOD, GOOD, NONE), drive, 40.0, None)
+    seen(Residuals(GOOD, GOOD, NONE), drive, 40.0, None)
     # A worn line is found along little of its length, but where it is.
     worn = border(0.1, 1.0, 1)
-    check_lines_seen(Residuals(worn, GOOD, NONE), drive, 40.0, None)
+    seen(Residuals(worn, GOOD, NONE), drive, 40.0, None)
     # But not where the middle of the lane, on a mottled floor, meets as many.
     with pytest.raises(TrackingLostError, match=r"one line only .*of the left line"):
-        check_lines_seen(Residuals(worn, GOOD, border(0.08, 3.0, 2)), drive, 40.0, None)
+        seen(Residuals(worn, GOOD, border(0.08, 3.0, 2)), drive, 40.0, None)
     # A map that is bent is looked at, and rejected.
-    check_lines_seen(Residuals(border(0.9, 4.0, 1), GOOD, NONE), drive, 40.0, None)
+    seen(Residuals(border(0.9, 4.0, 1), GOOD, NONE), drive, 40.0, None)
     met_by_chance = border(0.25, 4.0, 1)
     with pytest.raises(
         TrackingLostError, match=r"one line only .* 2\d % of the left line.* 2\.\d px.*of the left line"
     ):
-        check_lines_seen(Residuals(met_by_chance, GOOD, NONE), drive, 40.0, None)
+        seen(Residuals(met_by_chance, GOOD, NONE), drive, 40.0, None)
     with pytest.raises(TrackingLostError, match=r"no lane: .*of the left and the right line"):
-        check_lines_seen(Residuals(met_by_chance, border(0.3, 4.0, 2), NONE), drive, 40.0, None)
+        seen(Residuals(met_by_chance, border(0.3, 4.0, 2), NONE), drive, 40.0, None)
     with pytest.raises(TrackingLostError, match=r"no lane: .*along 1. %"):
-        check_lines_seen(Residuals(border(0.15, 4.0, 1), border(0.15, 4.0, 2), NONE), drive, 40.0, None)
+        seen(Residuals(border(0.15, 4.0, 1), border(0.15, 4.0, 2), NONE), drive, 40.0, None)
+
+
+def test_what_is_withheld_of_a_line_tells_whether_it_is_one(both_lines):
+    drive = open_drive(both_lines)
+    false, kept = border(0.2, 4.0, 1), border(0.55, 3.0, 2)
+    with pytest.raises(TrackingLostError, match="one line only"):
+        check_lines_seen(Residuals(false, GOOD, NONE), Residuals(kept, GOOD, NONE), drive, 40.0, None)
+    # A worn line on a mottled floor, of which the bare parts are withheld.
+    worn, floor = border(0.17, 0.3, 1), border(0.11, 3.0, 3)
+    kept = Residuals(border(0.25, 0.3, 2), GOOD, border(0.07, 3.0, 3))
+    check_lines_seen(Residuals(worn, GOOD, floor), kept, drive, 40.0, None)
 
 
 def test_a_line_that_meets_edges_by_chance_where_a_lane_of_another_width_is(both_lines):
     with pytest.raises(CalibrationError, match=r"no two lines 20 cm apart .* 40 cm apart"):
-        check_lines_seen(Residuals(border(0.25, 4.0, 1), GOOD, NONE), open_drive(both_lines), 20.0, 40.2)
+        seen(Residuals(border(0.25, 4.0, 1), GOOD, NONE), open_drive(both_lines), 20.0, 40.2)
 
 
 def test_no_line_at_all(tmp_path):
