@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lanenet.data.detections import DetectionTable, check_table_path
-from lanenet.data.drives.motion import Motion, commanded_motion
+from lanenet.data.drives.motion import Motion, motion_of_commands
 from lanenet.data.drives.sources import Source
 from lanenet.data.files import atomic_file, check_destination
 from lanenet.errors import CalibrationError, DriveFormatError, UnreadableFrameError
@@ -178,7 +178,7 @@ def run_detector(
     complete = steered = 0
     motion = None
     if camera is not None and source.commands is not None:
-        motion = commanded_motion(source.commands, source.t_s, source.starts, camera.wheelbase_cm)
+        motion = motion_of_commands(source.commands, source.t_s, source.starts, camera.wheelbase_cm)
     running = run_detectors(source, {ONE: detector}, motion, skip_unreadable=skip_unreadable)
     with ExitStack() as stack:
         writer = _AnnotatedVideo(stack, video, camera, source.rate_hz) if video is not None else None

@@ -31,7 +31,7 @@ from datagen.world.world import World
 from lanenet.cli.train import run_settings_schema
 from lanenet.config import load_settings
 from lanenet.data.drives import Commands
-from lanenet.data.drives.motion import commanded_motion
+from lanenet.data.drives.motion import motion_of_commands
 from lanenet.data.maps.mapped_drive import LabelledFrames
 from lanenet.evaluation.answers import answer_frames
 from lanenet.evaluation.decisions import Decisions, decide
@@ -111,7 +111,7 @@ def frames_of(world: World, name: str) -> LabelledFrames:
         starts=starts,
         points_cm=np.array([window.labelled(points) for points in points_cm]),
         image=images.__getitem__,
-        motion=commanded_motion(commands, t_s, starts, world.camera.wheelbase_cm),
+        motion=motion_of_commands(commands, t_s, starts, world.camera.wheelbase_cm),
     )
 
 
@@ -152,7 +152,7 @@ def table_of(paths: list[Path]) -> TextTable:
             np.concatenate([drive[f"{variant} {what}"] for drive in drives]) for what in ("cm", "sigma")
         )
         found = decide(own_cm, known_cm, sigma_cm, cuts, cuts)
-        by_drive = _rmse_by_drive(own_cm, known_cm, cuts)
+        by_drive = _squares_by_drive(own_cm, known_cm, cuts)
         whole = by_drive if variant == WHOLE else whole
         difference = "" if variant == WHOLE else "{:+.2f} to {:+.2f}".format(*_paired(by_drive, whole))
         answered = np.isfinite(own_cm)[np.isfinite(known_cm)].mean()
@@ -176,10 +176,10 @@ def _cells(found: Decisions) -> list[str]:
     return [*counts[0], *counts[1], f"{found.rmse_cm:.2f}", f"{found.p99_cm:.2f}"]
 
 
-def _rmse_by_drive(
+def _squares_by_drive(
     own_cm: Float[np.ndarray, "n 6"], known_cm: Float[np.ndarray, "n 6"], cuts: np.ndarray
 ) -> Float[np.ndarray, "d 2"]:
-    """Return the sum of squared errors and their number of each drive."""
+    """Return the sum of squared errors and their number, of each drive."""
     squares = [part**2 for part in np.split(np.asarray(own_cm - known_cm, np.float64), cuts)]
     return np.array([(np.nansum(part), np.isfinite(part).sum()) for part in squares])
 

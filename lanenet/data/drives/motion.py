@@ -30,7 +30,7 @@ class Motion:
         return Motion(self.travel_cm[rows], self.turn_rad[rows], self.wheelbase_cm)
 
 
-def commanded_motion(
+def motion_of_commands(
     commands: Commands, t_s: Float[np.ndarray, "n"], starts: Bool[np.ndarray, "n"], wheelbase_cm: float
 ) -> Motion | None:
     """Predict the motion from the commands of the frames before, as the car's loop does.
@@ -54,10 +54,10 @@ def commanded_motion(
     return Motion(travel_cm, turn_rad, wheelbase_cm)
 
 
-def motion_between(
+def motion_of_poses(
     poses: Float[np.ndarray, "n 3"], starts: Bool[np.ndarray, "n"], wheelbase_cm: float
 ) -> Motion:
-    """Return the motion between consecutive poses of the rear axle; see :func:`commanded_motion`."""
+    """Return the motion between consecutive poses of the rear axle; see :func:`motion_of_commands`."""
     step_cm, heading = np.diff(poses[:, :2], axis=0), poses[:-1, 2]
     ahead = step_cm[:, 0] * np.cos(heading) + step_cm[:, 1] * np.sin(heading) >= 0.0
     travel_cm, turn_rad = np.full((2, len(poses)), np.nan)

@@ -18,7 +18,7 @@ from lanenet.config import check_settings, read_yaml
 from lanenet.data.drives import Drive, open_drive
 from lanenet.data.drives.content import other_images
 from lanenet.data.drives.folder import TRUTH_FILE, read_truth
-from lanenet.data.drives.motion import Motion, commanded_motion, motion_between
+from lanenet.data.drives.motion import Motion, motion_of_commands, motion_of_poses
 from lanenet.data.label_set import Source
 from lanenet.data.maps.folder import SETTINGS_NAME, DriveMap, read_map
 from lanenet.data.maps.frame_lines import FrameLines, lines_of_frame, parallel_line
@@ -470,5 +470,5 @@ def _motion(
     drive: Drive, poses: Float[np.ndarray, "n 3"], starts: Bool[np.ndarray, "n"], wheelbase_cm: float
 ) -> Motion:
     """Return the motion as it was commanded, or by the poses where that was not recorded."""
-    commanded = commanded_motion(drive.commands, drive.t_s, starts, wheelbase_cm)
-    return motion_between(poses, starts, wheelbase_cm) if commanded is None else commanded
+    commanded = motion_of_commands(drive.commands, drive.t_s, starts, wheelbase_cm)
+    return motion_of_poses(poses, starts, wheelbase_cm) if commanded is None else commanded
