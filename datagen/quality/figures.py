@@ -105,7 +105,7 @@ def map_evidence(
     meta, height_cm = drive_map.meta, drive_map.camera.mounting.height_cm
     told_cm = figures["given"]["lane_width_cm"]
     calibration = figures.get("calibration", {})
-    segments = figures["segments_mapped"]
+    segments, frames = figures["segments_mapped"], np.bincount(drive_map.segment)
     revisits = sum(segment["revisits"] for segment in segments)
     across_cm = sum((segment["closure_across_cm"] or 0.0) * segment["revisits"] for segment in segments)
     # A given camera that the drive has refined counts as known: its lens was not searched for.
@@ -118,7 +118,7 @@ def map_evidence(
         wrong_share=quality.wrong_share,
         revisits=revisits,
         laps=max(meta.laps, int(np.ptp(drive_map.poses[:, 2]) / (2.0 * np.pi))),
-        comes_round=all(segment["closed"] for segment in segments),
+        comes_round=segments[int(np.argmax(frames))]["closed"],
         closure_across_heights=across_cm / revisits / height_cm if revisits else None,
         sigma={} if known else calibration["sigma"],
         # Reports of earlier versions do not know.
@@ -137,7 +137,7 @@ def map_evidence(
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
-        segments=len(segments),
+        elsewhere=int(frames.sum() - frames.max()),
         pauses=figures.get("pauses", 0),
     )
 

@@ -86,11 +86,11 @@ class MapEvidence:
         strain: Distance of a found camera's principal point and roll from those of ordinary ones, and of its
             odometry from the closed loops, in sigmas.
         alike: Whether places were seen twice, but do not tell how long a lap is.
-        segments: Number of segments of the map.
+        elsewhere: Frames outside the largest segment, which show no place of it.
         pauses: How often the recording pauses, if it does so again and again.
         wrong_share: Share of the lines' length in sections that the images contradict.
         wrong: These sections, in words.
-        comes_round: Whether the road of every segment ends where it begins.
+        comes_round: Whether the road of the largest segment ends where it begins.
         bend_lane_cm: Width of the lane in bends, if it is another one there; else None.
         open_lane_cm: Narrowest and widest tenth of a lane of many widths that has no straight; else None.
         outer_lane_cm: Lane width that the user gave, if the lines that are so far apart bound several lanes,
@@ -115,7 +115,7 @@ class MapEvidence:
     ahead_cm: float
     laps: int
     strain: float
-    segments: int
+    elsewhere: int
     pauses: int
     wrong_share: float
     alike: bool = False
@@ -345,11 +345,10 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
         return "wrong in sections", ": its laps do not lie on one another"
     if e.wrong_share > _WRONG_SHARE:
         return "wrong in sections", f", of which the longest is {e.wrong[0]}" if e.wrong else ""
-    if e.segments > 1:
-        return "open", f": its {e.segments} segments show no place of each other"
     if not e.revisits or e.alike:
         return "open", ": how long a lap is stays open" if e.alike else ": no place was certainly seen twice"
-    return ("closed", "") if e.comes_round else ("open", ": the road does not come round")
+    apart = f", but for {counted(e.elsewhere, 'frame')} that show no place of it" if e.elsewhere else ""
+    return ("closed", apart) if e.comes_round else ("open", f": the road does not come round{apart}")
 
 
 def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:

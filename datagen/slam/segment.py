@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.slam.adjustment.adjust import BundleEstimate, BundleResult, adjust
+from datagen.slam.adjustment.adjust import CAMERA_NAMES, BundleEstimate, BundleResult, adjust
 from datagen.slam.commands import MOST_BRIDGED, CommandedMotion, SteeringFit, commands_of, fit_steering
 from datagen.slam.filter.dp_slam import Trajectory
 from datagen.slam.keyframes import (
@@ -25,6 +25,7 @@ from datagen.slam.keyframes import (
 from datagen.slam.loops.consistency import (
     consistent_revisits,
     of_one_lap,
+    of_one_length,
     with_supported,
     without_contradicted,
 )
@@ -33,6 +34,7 @@ from datagen.slam.loops.parts import (
     LEAST_TIED,
     carried,
     connected,
+    joined_twice,
     placing_revisits,
     tied_frames,
     whole_turns,
@@ -68,18 +70,20 @@ _ADJUST = "adjust poses"
 #: Camera parameters that are observable without a loop closure. The focal length is not: before the loop was
 #: closed it diverged on two of three real drives.
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
-#: Median residuals of revisits after closure along and across the road, in camera heights, and misfit of the
-#: frames relative to before, at most. True closures leave 0.08 and 0.03 heights on the real drives; places
-#: that only look alike, as on an open road, leave more.
-MAX_MISSED, MAX_MISFIT = (0.6, 0.3), 1.1
+#: Median residuals of revisits after closure along and across the road, in camera heights, and misfit of
+#: neighbouring frames relative to before, at most. True closures leave 0.08 and 0.03 heights on the real
+#: drives, and a misfit of 1.08 times at most on these and on rings of tiles; places that only look alike, as
+#: on an open road, leave more.
+MAX_MISSED, MAX_MISFIT = (0.6, 0.3), 1.15
 #: The camera is adjusted until its focal length moves by less than this share, or so often. Chosen: a tenth
 #: of the uncertainty of the focal length on a good drive (2 to 3 %).
 _SETTLED, _MAX_CAMERA_ROUNDS = 0.003, 6
-#: Heading that the open loop misses in a lap, [rad], with a known camera and with one that is yet to be
-#: found, and over a gap that was bridged. Measured: with the cameras that they had found, 0.30 on
-#: ``garage_tape``, 0.26 on ``usi_mat`` and 0.49 on ``donkey_circuit``, and 0.05 over the gaps of the last;
-#: on rings of tiles 0.05 at most, and 0.3 to 1.2 where the closure was false.
-_DRIFT_RAD, _GAP_RAD = (0.3, 0.8), 0.05
+#: Heading that the open loop misses in a lap, [rad]; in addition, per logarithm of a focal length that is
+#: off; and over a gap that was bridged. Measured: with the cameras that they had found, 0.30 on
+#: ``garage_tape``, 0.26 on ``usi_mat`` and 0.49 on ``donkey_circuit``, and 0.05 over the gaps of the last; on
+#: rings of tiles 0.05 at most, and 0.3 to 1.2 where the closure was false; with focal lengths that were 4 and
+#: 10 % off, a turn that was 2 and 23 % off.
+_DRIFT_RAD, _DRIFT_OF_LENS_RAD, _GAP_RAD = 0.3, 15.0, 0.05
 #: Log likelihood of a revisit that a closure explains, over that of a false one, which may lie anywhere
 #: within the search. Chosen: far below the ratio of both volumes, 8, since neighbours err alike.
 _EXPLAINED = 1.0
@@ -100,12 +104,21 @@ _STAYS_RAD, _MOST_REPEATED = 0.04, 11
 #: length of a short straight. Measured, the least of a drive: 0.95 on circles, 0.8 where a ring was closed
 #: falsely, 0.63 to 0.67 on rings with corners.
 _BESIDE_HEIGHTS, _TELLS = (4.0, 8.0, 12.0), 0.75
+#: Heading by which places beside each other on a straight may differ, [rad]. Chosen: below that of a circle
+#: of 40 camera heights, 12 of them further on.
+_STRAIGHT_RAD = 0.3
 #: Ratio of the misfits of another way around and of the best one, up to which the other explains the images
 #: as well. Measured on rings of tiles: 1.5 and more beside the true one, 1.03 to 1.14 where both were false.
 _NEAR = 1.25
-#: Laps that differ in length by more than this logarithm, or in their turn, [rad], lead along other ways.
-#: Chosen: less than a tile of a ring of ten, and less than half a corner.
-_OTHER_LAP, _OTHER_TURN_RAD = 0.1, 0.25 * np.pi
+#: Heading that their odometry may miss beyond that of the likeliest, in sigmas of a known camera. Chosen:
+#: three sigmas; on a ring whose loops were closed rightly, the rivals' missed 10 and 11.
+_MORE_MISSED = 3.0
+#: Closures by different ways around whose camera is adjusted. Chosen: the true one was the first or second
+#: of four rings of tiles.
+_MOST_RIVALS = 3
+#: Laps that differ in length by more than this logarithm, or in their whole turns, lead along other ways.
+#: Chosen: less than a tile of a ring of ten.
+_OTHER_LAP = 0.1
 
 
 @dataclass(frozen=True)
@@ -128,6 +141,7 @@ class SolvedSegment:
         decided: Whether revisits tell how long a lap is: beside them places look otherwise.
         missed: Heading that the open loop misses in a lap, in sigmas of one with a known camera; 0 without a
             revisit within a part.
+        rivals: Cameras that other ways to close the loops need, the likeliest first.
     """
 
     rows: Int[np.ndarray, "n"]
@@ -143,6 +157,7 @@ class SolvedSegment:
     keys: Int[np.ndarray, "k"] | None = None
     decided: bool = True
     missed: float = 0.0
+    rivals: tuple[Camera, ...] = ()
 
     @property
     def ties_camera(self) -> bool:
@@ -349,19 +364,21 @@ class _Closure:
     decided: bool = True
 
 
-def _lap(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> tuple[float, float]:
-    """Length of a lap, [cm], and how far it turns, [rad]; medians over revisits."""
-    path = path_lengths(poses)
-    between = np.array([path[r.later] - path[r.earlier] for r in revisits])
-    turned = np.array([poses[r.later, 2] - poses[r.earlier, 2] - r.relative[2] for r in revisits])
-    once = of_one_lap(between)
-    return float(np.median(between[once])), float(np.median(turned[once]))
+def _go_around_alike(path_cm: Float[np.ndarray, "n"], one: list[Revisit], other: list[Revisit]) -> bool:
+    """Whether the laps by two sets of revisits are as long, and turn as often.
 
-
-def _go_around_alike(one: _Closure, other: _Closure) -> bool:
-    """Whether the laps of two closures are as long, and turn as much."""
-    (a_cm, a_rad), (b_cm, b_rad) = (_lap(c.bundle.poses, c.revisits) for c in (one, other))
-    return bool(abs(np.log(a_cm / b_cm)) < _OTHER_LAP and abs(a_rad - b_rad) < _OTHER_TURN_RAD)
+    Args:
+        path_cm: Length of the open loop up to each frame.
+        one: Revisits.
+        other: Others.
+    """
+    lengths, turns = [], []
+    for revisits in (one, other):
+        between_cm = np.array([path_cm[r.later] - path_cm[r.earlier] for r in revisits])
+        once = of_one_lap(between_cm)
+        lengths.append(float(np.median(between_cm[once])))
+        turns.append(float(np.median(np.array([r.turns for r in revisits])[once])))
+    return bool(abs(np.log(lengths[0] / lengths[1])) < _OTHER_LAP and turns[0] == turns[1])
 
 
 def shared_misfits(bundles: Sequence[BundleResult]) -> list[float]:
@@ -423,7 +440,8 @@ class _DenseSegment:
         solver.tell(_ADJUST, 2, 3)
         if self.find_camera:
             rivals = [self.adjust_with_camera(one, _together(matched, one.revisits)) for one in rivals]
-        closure = self.likeliest(rivals, opened)
+        likely = self.likeliest_first(rivals, opened)
+        closure = likely[0] if likely else None
         bundle, road = (opened, view.road) if closure is None else (closure.bundle, closure.road)
         solver.tell(_ADJUST, 3, 3)
         return SolvedSegment(
@@ -438,7 +456,8 @@ class _DenseSegment:
             bundle=bundle,
             part=self.part,
             decided=closure is None or closure.decided,
-            missed=0.0 if closure is None else self.missed(closure, opened, _DRIFT_RAD[False]),
+            missed=0.0 if closure is None else self.missed(closure, opened, _DRIFT_RAD),
+            rivals=tuple(one.bundle.camera for one in likely[1:]),
         )
 
     def open_loop(self, start: BundleEstimate) -> BundleResult:
@@ -474,17 +493,22 @@ class _DenseSegment:
         """Close the loops with each set of revisits that may be true.
 
         Returns:
-            The likeliest one of those that go around alike; each of the others where the camera is yet to be
-            found, since a wrong camera makes up for much.
+            The likeliest one of those that go around alike; the likeliest of the others too where the camera
+            is yet to be found, since a wrong camera makes up for much.
         """
         found: list[_Closure] = []
         tried: set[tuple[tuple[int, int, int], ...]] = set()
-        for rivals in self.sets_to_try(opened.poses, matched):
+        path_cm = path_lengths(opened.poses)
+        for rivals, otherwise in self.sets_to_try(opened.poses, matched):
             for group in rivals:
-                grown = self.grown(opened.poses, group, matched)
+                if otherwise and any(_go_around_alike(path_cm, group, one.revisits) for one in found):
+                    continue
+                grown = joined_twice(
+                    opened.poses, self.part, self.grown(opened.poses, group, matched), self.height
+                )
                 # The same pairs with other whole turns between them are another way around.
                 key = tuple(sorted((r.earlier, r.later, r.turns) for r in grown))
-                if key in tried:
+                if key in tried or len(grown) < self.revisit_settings.min_revisits:
                     continue
                 tried.add(key)
                 closure = self.try_closure(grown, opened)
@@ -493,11 +517,10 @@ class _DenseSegment:
                     break
         chosen: list[_Closure] = []
         for one in sorted(found, key=lambda closure: self.cost(closure, opened)):
-            if not any(_go_around_alike(one, other) for other in chosen):
+            if not any(_go_around_alike(path_cm, one.revisits, other.revisits) for other in chosen):
                 chosen.append(one)
-        if not self.find_camera:
-            chosen = chosen[:1]
-        return [self.confirmed_closure(one, opened, matched) for one in chosen]
+        most = _MOST_RIVALS if self.find_camera else 1
+        return [self.confirmed_closure(one, opened, matched) for one in chosen[:most]]
 
     def confirmed_closure(self, closure: _Closure, opened: BundleResult, matched: list[Revisit]) -> _Closure:
         """Close the loops again where the adjusted map tells better which revisits are true.
@@ -538,42 +561,55 @@ class _DenseSegment:
 
     def sets_to_try(
         self, poses: Float[np.ndarray, "n 3"], matched: list[Revisit]
-    ) -> Iterator[list[list[Revisit]]]:
-        """Sets of revisits that may be true together; of each group, the first that fits is enough."""
+    ) -> Iterator[tuple[list[list[Revisit]], bool]]:
+        """Sets of revisits that may be true together, and whether only another way around is of interest.
+
+        Of each group of sets, the first that fits is enough.
+        """
         s = self.revisit_settings
         for explained, _ in consistent_revisits(poses, matched, s):
             supported = with_supported(poses, explained, matched, self.height, s)
             # Neighbours may support more than the drift explains. Where these do not fit, the explained may.
             groups = [supported, explained] if len(supported) > len(explained) else [supported]
-            left = [without_contradicted(poses, group, self.height) for group in groups]
-            yield [
-                few if len(few) >= s.min_revisits else group for few, group in zip(left, groups, strict=True)
-            ]
+            yield [self.uncontradicted(poses, group) for group in groups], False
         alike = [r for r in matched if not r.faces]
         placing = [placing_revisits(poses, self.part, some, self.height) for some in (matched, alike)]
-        yield [one for one in placing if len(one) >= s.min_revisits]
+        yield [one for one in placing if len(one) >= s.min_revisits], False
         # A wrong camera bends the open loop: then true revisits explain each other better than it does.
         if len(matched) >= s.min_revisits:
-            yield [[replace(r, turns=whole_turns(poses, r)) for r in matched]]
+            yield [[replace(r, turns=whole_turns(poses, r)) for r in matched]], False
+        # Where all corners look alike, most pairs may be wrong; those as far apart share one mistake.
+        within = [r for r in matched if self.part[r.earlier] == self.part[r.later]]
+        for together in of_one_length(poses, within, s) if self.find_camera else []:
+            for explained, _ in consistent_revisits(poses, together, s):
+                yield [self.uncontradicted(poses, explained)], True
+
+    def uncontradicted(self, poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> list[Revisit]:
+        """Leave out revisits that those beside them contradict, unless too few would be left."""
+        left = without_contradicted(poses, revisits, self.height)
+        return left if len(left) >= self.revisit_settings.min_revisits else revisits
 
     def cost(self, closure: _Closure, opened: BundleResult) -> float:
-        """Cost of a closure beside others that go around alike."""
-        return len(self.part) * closure.bundle.misfit + self.beside_images(closure, opened)
+        """Cost of a closure beside others that go around alike: the one that explains most is best."""
+        within = sum(self.part[r.earlier] == self.part[r.later] for r in closure.revisits)
+        frames = len(self.part) * closure.bundle.misfit
+        return frames + closure.bundle.prior + self.beside_images(closure, opened) - _EXPLAINED * within
 
     def beside_images(self, closure: _Closure, opened: BundleResult) -> float:
-        """Negative log likelihood of a closure's revisits, and of the heading that odometry misses in a lap.
+        """Negative log likelihood of what joins the parts, and of the heading that odometry misses in a lap.
 
         A lap with five corners instead of four may look alike in all frames; the odometry knows better. It
-        knows less where a gap was bridged, and where the camera is still to be found. And a car that was
-        turned round or lifted goes on near where it was.
+        knows less where a gap was bridged, and where its camera was another one. And a car that was turned
+        round or lifted goes on near where it was. The number of revisits does not count: a lap that is too
+        short has more.
         """
         group, breaks = connected(self.part, closure.revisits), np.flatnonzero(np.diff(self.part))
         breaks = breaks[group[breaks] == group[breaks + 1]]
         moved = carried(closure.bundle.poses, breaks, self.height)
         joins = len(np.unique(self.part)) - len(np.unique(group))
-        within = sum(self.part[r.earlier] == self.part[r.later] for r in closure.revisits)
-        missed = self.missed(closure, opened, _DRIFT_RAD[self.find_camera])
-        return 0.5 * missed**2 + moved - JOINED * joins - _EXPLAINED * within
+        other = float(np.log(closure.bundle.camera.K[0, 0] / opened.camera.K[0, 0]))
+        missed = self.missed(closure, opened, float(np.hypot(_DRIFT_RAD, _DRIFT_OF_LENS_RAD * other)))
+        return 0.5 * missed**2 + moved - JOINED * joins
 
     def missed(self, closure: _Closure, opened: BundleResult, drift_rad: float) -> float:
         """Heading that odometry misses in a lap of a closure, in sigmas, of which its drift is one part."""
@@ -585,8 +621,8 @@ class _DenseSegment:
         gaps = float(np.sum((periods > 1.0) & (periods <= MOST_BRIDGED))) / laps
         return abs(heading_drift(opened.poses, within)[1]) / float(np.hypot(drift_rad, gaps**0.5 * _GAP_RAD))
 
-    def likeliest(self, rivals: Sequence[_Closure], opened: BundleResult) -> _Closure | None:
-        """Choose among closures that go around by other ways; None if there are none.
+    def likeliest_first(self, rivals: Sequence[_Closure], opened: BundleResult) -> list[_Closure]:
+        """Order closures that go around by other ways by their likelihood.
 
         What counts is how well the pairs of frames agree that each of them compares, how unlike ordinary ones
         the camera is that it needs, and what counts between closures that go around alike. The motion's
@@ -594,42 +630,49 @@ class _DenseSegment:
         around may do, with a camera for each.
         """
         if not rivals or not self.find_camera:
-            return rivals[0] if rivals else None
+            return list(rivals)
         agree = shared_misfits([one.bundle for one in rivals])
-        costs = [
-            len(self.part) * misfit + one.bundle.prior + self.beside_images(one, opened)
-            for one, misfit in zip(rivals, agree, strict=True)
+        explain = [
+            len(self.part) * misfit + one.bundle.prior for one, misfit in zip(rivals, agree, strict=True)
         ]
-        best = int(np.argmin(costs))
-        chosen = rivals[best].bundle
+        costs = np.add(explain, [self.beside_images(one, opened) for one in rivals])
+        missed = [self.missed(one, opened, _DRIFT_RAD) for one in rivals]
+        best, *others = np.argsort(costs).tolist()
         near = [
-            one.bundle for one, misfit in zip(rivals, agree, strict=True) if misfit <= _NEAR * agree[best]
+            rivals[k].bundle.camera
+            for k in (best, *others)
+            if explain[k] <= _NEAR * explain[best] and missed[k] <= missed[best] + _MORE_MISSED
         ]
+        chosen = rivals[best].bundle
+        camera = chosen.camera
         apart = {
-            "focal": max(abs(float(np.log(one.camera.K[0, 0] / chosen.camera.K[0, 0]))) for one in near),
-            "pitch": max(
-                abs(one.camera.mounting.pitch_down_rad - chosen.camera.mounting.pitch_down_rad)
-                for one in near
-            ),
+            "focal": max(abs(float(np.log(one.K[0, 0] / camera.K[0, 0]))) for one in near),
+            "pitch": max(abs(one.mounting.pitch_down_rad - camera.mounting.pitch_down_rad) for one in near),
         }
         # The lens is known no better than those agree that explain the images as well.
         spanning = chosen.sigma | {name: max(chosen.sigma[name], most) for name, most in apart.items()}
         closure = replace(rivals[best], bundle=replace(chosen, sigma=spanning))
-        return replace(closure, decided=self.tells_places(closure, opened))
+        decided = replace(closure, decided=self.tells_places(closure, opened))
+        return [decided, *(rivals[k] for k in others)]
 
     def tells_places(self, closure: _Closure, opened: BundleResult) -> bool:
-        """Whether a later visit matches the earlier one better than places beside that.
+        """Whether revisits tell how far a lap turns: places beside them match worse.
 
-        All along a circle they match as well, and no revisit says how long a lap is.
+        All along a circle they match as well, with any turn; along a straight too, but with the same one.
         """
-        matcher, path = self.place_matcher(opened), path_lengths(opened.poses)
+        matcher, path, heading = self.place_matcher(opened), path_lengths(opened.poses), opened.poses[:, 2]
         for r in closure.revisits:
+            turned: list[float] = []
             for beside in _BESIDE_HEIGHTS:
                 at_cm = path[r.earlier] + np.array([-1.0, 1.0]) * beside * self.height
                 pairs = [(int(k), r.later) for k in np.searchsorted(path, at_cm) if k < r.later]
-                others = matcher.matched(pairs, self.solver.rng)
-                if all(other.match < _TELLS * r.match for other in others):
+                found = matcher.matched(pairs, self.solver.rng)
+                alike = [other.earlier for other in found if other.match >= _TELLS * r.match]
+                if not alike:
                     return True
+                turned += np.abs(heading[alike] - heading[r.earlier]).tolist()
+            if max(turned) < _STRAIGHT_RAD:
+                return True
         return False
 
     def grown(
@@ -660,10 +703,12 @@ class _DenseSegment:
             return None
         loops = loop_pairs(revisits, self.part)
         start = replace(opened, poses=poses)
-        closed = self.adjust(self.observed, start, free=self.free, loops=loops, with_sigma=False)
-        return (
-            _Closure(revisits, closed, self.view.road) if closed.misfit < MAX_MISFIT * opened.misfit else None
-        )
+        # Without its lens, a wrong camera would refuse the true closure, and a false one bends with less.
+        free = CAMERA_NAMES if self.find_camera else ()
+        closed = self.adjust(self.observed, start, free=free, loops=loops, with_sigma=False)
+        # Loops add pairs, which agree less than neighbours; those may not agree less than they did.
+        after, before = shared_misfits([closed, opened])
+        return _Closure(revisits, closed, self.view.road) if after < MAX_MISFIT * before else None
 
     def adjust_with_camera(self, closure: _Closure, matched: list[Revisit]) -> _Closure:
         """Adjust all of the camera with the poses, in rounds: another camera sees other edges on the road."""

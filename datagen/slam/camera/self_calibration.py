@@ -191,13 +191,24 @@ def find_camera(drive: Drive, start: Camera | None, solver: SegmentSolver) -> Fo
         camera = start
         settings = settings.model_copy(update={"bundle": refining(settings.bundle)})
         solver = replace(solver, settings=settings)
-    solved = solver.solve(drive, camera, find_camera=True)
+    first = solved = solver.solve(drive, camera, find_camera=True)
+
+    def strain_of(one: SolvedSegment) -> float:
+        return float(np.hypot(prior_strain(one.camera, camera, settings.bundle), one.missed))
+
     if start is None:
-        solved = _restarted(drive, camera, solved, solver)
+        solved = _restarted(drive, camera, first, solver)
+        # Each way to close the loops has a camera, with which its odometry agrees if the way is the true one.
+        for rival in first.rivals:
+            if strain_of(solved) <= MAX_STRAIN[0]:
+                break
+            prior = _prior(camera, rival, float(rival.K[0, 0]))
+            again = solver.solve(drive, rival, find_camera=True, prior_camera=prior)
+            if again.ties_camera:
+                solved = min(solved, again, key=strain_of)
     strain = prior_strain(solved.camera, camera, settings.bundle)
     sigma = honest_sigma(solved.bundle.sigma, solved.ties_camera, strain, settings.bundle, camera.width)
-    strain = float(np.hypot(strain, solved.missed))
-    return FoundCamera(solved, candidates, sigma, start is not None, strain)
+    return FoundCamera(solved, candidates, sigma, start is not None, strain_of(solved))
 
 
 def _restarted(drive: Drive, searched: Camera, first: SolvedSegment, solver: SegmentSolver) -> SolvedSegment:
@@ -218,10 +229,8 @@ def _restarted(drive: Drive, searched: Camera, first: SolvedSegment, solver: Seg
             break
         else:
             focal_px = float(searched.K[0, 0]) * factor
-        # The camera of a closed loop is the best start, also for the lever, which every bend depends on. But
-        # the priors of principal point, roll and k1 must not move along with what was found of them.
-        turned = looking_alike(searched, found.camera if found.revisits else first.camera)
-        prior = nudged(turned, "focal", float(np.log(focal_px / searched.K[0, 0])))
+        # The camera of a closed loop is the best start, also for the lever, which every bend depends on.
+        prior = _prior(searched, found.camera if found.revisits else first.camera, focal_px)
         start = found.camera if found.revisits else prior
         again = solver.solve(drive, start, find_camera=True, prior_camera=prior)
         if len(again.revisits) < 0.5 * len(found.revisits):
@@ -229,6 +238,11 @@ def _restarted(drive: Drive, searched: Camera, first: SolvedSegment, solver: Seg
             return found
         found = again
     return found if found.revisits else first
+
+
+def _prior(searched: Camera, found: Camera, focal_px: float) -> Camera:
+    """Centre of the priors beside a camera that was found: those of principal point, roll and k1 stay."""
+    return nudged(looking_alike(searched, found), "focal", float(np.log(focal_px / searched.K[0, 0])))
 
 
 def _close(found: Camera, start: Camera) -> bool:

@@ -34,6 +34,8 @@ _SMALL_DRIFT_RAD = 0.6
 #: Gaps between two visits up to so many times the shortest tenth of them are those of one lap. Chosen: below
 #: two, with room for places at the ends of the tenth.
 _ONE_LAP = 1.4
+#: Logarithm by which paths that count as equally long may differ. Chosen: half a corner of a ring of eight.
+_SAME_LENGTH = 0.07
 #: What two revisits may miss of each other: in camera heights, as a share of the path between them, over
 #: which the open loop drifts, and in heading, [rad]. Chosen: less than a lane, and than the drift of a bad
 #: open loop.
@@ -192,6 +194,32 @@ def without_contradicted(
 def of_one_lap(between_cm: Float[np.ndarray, "r"]) -> Bool[np.ndarray, "r"]:
     """Which paths between two visits of a place are one lap long: later visits may skip laps."""
     return between_cm <= _ONE_LAP * np.percentile(between_cm, 10)
+
+
+def of_one_length(
+    poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], settings: RevisitSettings
+) -> list[list[Revisit]]:
+    """Group the revisits between whose visits the path is about as long, the largest group first.
+
+    On a ring whose corners all look alike, each corner is taken for each other: every group is right or wrong
+    as a whole.
+
+    Args:
+        poses: Open-loop trajectory.
+        revisits: Revisits; one that has too few of its length is in no group.
+        settings: Bounds.
+    """
+    path = path_lengths(poses)
+    left, groups = list(revisits), []
+    while len(left) >= settings.min_revisits:
+        length = np.log([path[r.later] - path[r.earlier] for r in left])
+        near = np.abs(length - length[:, None]) < _SAME_LENGTH
+        most = near[int(near.sum(axis=0).argmax())]
+        if most.sum() < settings.min_revisits:
+            break
+        groups.append([r for r, one in zip(left, most, strict=True) if one])
+        left = [r for r, one in zip(left, most, strict=True) if not one]
+    return groups
 
 
 def count_places(along_cm: Float[np.ndarray, "r"], camera_height_cm: float) -> int:

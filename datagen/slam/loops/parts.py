@@ -102,6 +102,33 @@ def placing_revisits(
     return [replace(r, turns=whole_turns(poses, r)) for r in chosen]
 
 
+def joined_twice(
+    poses: Float[np.ndarray, "n 3"],
+    part: Int[np.ndarray, "n"],
+    revisits: Sequence[Revisit],
+    camera_height_cm: float,
+) -> list[Revisit]:
+    """Leave out revisits that alone, at a single place, join parts which nothing else joins.
+
+    Args:
+        poses: Poses, each part in shape, in any place.
+        part: Part of the drive that each frame belongs to.
+        revisits: Revisits.
+        camera_height_cm: Sets the scale.
+    """
+    path, pair = path_lengths(poses), np.array([(part[r.earlier], part[r.later]) for r in revisits])
+    kept = list(revisits)
+    for a, b in np.unique(np.sort(pair[pair[:, 0] != pair[:, 1]], axis=1), axis=0).tolist():
+        these = [r for r in kept if {int(part[r.earlier]), int(part[r.later])} == {a, b}]
+        at = [r.later if part[r.later] == b else r.earlier for r in these]
+        if count_places(path[at], camera_height_cm) < _LEAST_PLACES:
+            others = [r for r in kept if all(r is not one for one in these)]
+            group = connected(part, others)
+            if len(np.unique(group[(part == a) | (part == b)])) > 1:
+                kept = others
+    return kept
+
+
 def carried(poses: Float[np.ndarray, "n 3"], breaks: Int[np.ndarray, "b"], camera_height_cm: float) -> float:
     """Negative log likelihood of the ways from the last frame before a break to the first one behind it.
 

@@ -28,7 +28,7 @@ GOOD = MapEvidence(
     tape_cm=1.9,
     ahead_cm=0.0,
     strain=0.0,
-    segments=1,
+    elsewhere=0,
     pauses=0,
     wrong_share=0.0,
 )
@@ -172,12 +172,12 @@ def test_nothing_is_good_that_nobody_knows():
     [
         ({}, "closed"),
         (OPEN, "open"),
-        ({"segments": 3}, "open"),
+        ({"elsewhere": 300, "comes_round": False}, "open"),
         ({"wrong": ("20 cm of the left line",), "wrong_share": 0.0099}, "closed"),
         ({"wrong": ("20 cm of the left line",), "wrong_share": 0.0101}, "wrong in sections"),
         ({"closure_across_heights": 0.2}, "wrong in sections"),
         # What is wrong is worse than what is open.
-        ({"segments": 3, "wrong": ("20 cm of the left line",), "wrong_share": 0.1}, "wrong in sections"),
+        ({"elsewhere": 300, "wrong": ("20 cm of the left line",), "wrong_share": 0.1}, "wrong in sections"),
     ],
 )
 def test_the_map_is_judged_apart_from_its_labels(changes, state):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datagen.slam.loops.consistency import consistent_revisits
+from datagen.slam.loops.consistency import consistent_revisits, of_one_length
 from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from lanenet.geometry.poses import path_lengths
 
@@ -152,3 +152,14 @@ def test_a_good_open_loop_is_tried_though_more_false_revisits_agree_on_a_large_d
     rates = [rate for revisits, rate in found if {(r.earlier, r.later) for r in revisits} == pairs]
     assert len(rates) == 1 and abs(rates[0]) * LAP_CM < 0.15
     assert {r.turns for revisits, rate in found if rate == rates[0] for r in revisits} == {1}
+
+
+def test_revisits_of_corners_that_look_alike_are_grouped_by_the_path_between_them():
+    """Each group has one lap length, within a drift of the path; single ones are in none."""
+    right = _visits(LAP, range(0, 60, 4))
+    half, three_quarters = _visits(LAP // 2, range(0, 60, 6)), _visits(3 * LAP // 4, range(0, 60, 10))
+    drifting = [replace(r, later=r.later + k % 3) for k, r in enumerate(right)]
+    others = _visits(LAP // 4, range(0, 20, 10))
+    groups = of_one_length(_laps(1, 2), [*others, *three_quarters, *drifting, *half], BOUNDS)
+    assert groups == [drifting, half, three_quarters]
+    assert of_one_length(_laps(1, 2), [], BOUNDS) == []
