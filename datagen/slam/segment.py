@@ -138,7 +138,9 @@ class SolvedSegment:
         bundle: The adjustment.
         part: Number of the part that each frame belongs to; between parts lies a long gap of the recording.
         keys: Keyframes by which a slow car was tracked; None where every frame is one.
-        decided: Whether revisits tell how long a lap is: beside them places look otherwise.
+        decided: Whether revisits tell how far a lap turns: beside them places look otherwise, or lie on a
+            straight.
+        alike: Whether places beside all revisits look like theirs, so that it is open how long a lap is.
         missed: Heading that the open loop misses in a lap, in sigmas of one with a known camera; 0 without a
             revisit within a part.
         rivals: Cameras that other ways to close the loops need, the likeliest first.
@@ -156,12 +158,13 @@ class SolvedSegment:
     part: Int[np.ndarray, "n"]
     keys: Int[np.ndarray, "k"] | None = None
     decided: bool = True
+    alike: bool = False
     missed: float = 0.0
     rivals: tuple[Camera, ...] = ()
 
     @property
     def ties_camera(self) -> bool:
-        """Whether a loop was closed that tells how long a lap is: that determines the lens."""
+        """Whether a loop was closed that tells how far a lap turns: that determines the lens."""
         return bool(self.revisits) and self.decided
 
     @property
@@ -355,13 +358,15 @@ class _Closure:
     """Loops that were closed with some revisits, the adjusted map, and the road that its camera sees.
 
     Attributes:
-        decided: Whether its revisits tell places.
+        decided: Whether its revisits tell how far a lap turns.
+        alike: Whether they do not tell how long it is.
     """
 
     revisits: list[Revisit]
     bundle: BundleResult
     road: RoadView
     decided: bool = True
+    alike: bool = False
 
 
 def _go_around_alike(path_cm: Float[np.ndarray, "n"], one: list[Revisit], other: list[Revisit]) -> bool:
@@ -456,6 +461,7 @@ class _DenseSegment:
             bundle=bundle,
             part=self.part,
             decided=closure is None or closure.decided,
+            alike=closure is not None and closure.alike,
             missed=0.0 if closure is None else self.missed(closure, opened, _DRIFT_RAD),
             rivals=tuple(one.bundle.camera for one in likely[1:]),
         )
@@ -652,15 +658,16 @@ class _DenseSegment:
         # The lens is known no better than those agree that explain the images as well.
         spanning = chosen.sigma | {name: max(chosen.sigma[name], most) for name, most in apart.items()}
         closure = replace(rivals[best], bundle=replace(chosen, sigma=spanning))
-        decided = replace(closure, decided=self.tells_places(closure, opened))
-        return [decided, *(rivals[k] for k in others)]
+        return [self.with_told(closure, opened), *(rivals[k] for k in others)]
 
-    def tells_places(self, closure: _Closure, opened: BundleResult) -> bool:
-        """Whether revisits tell how far a lap turns: places beside them match worse.
+    def with_told(self, closure: _Closure, opened: BundleResult) -> _Closure:
+        """Note what its revisits tell: places beside them match worse than their own.
 
-        All along a circle they match as well, with any turn; along a straight too, but with the same one.
+        All along a circle they match as well, with any lap. Along a straight they do, too, but with laps that
+        turn alike, which is what the lens depends on.
         """
         matcher, path, heading = self.place_matcher(opened), path_lengths(opened.poses), opened.poses[:, 2]
+        decided = False
         for r in closure.revisits:
             turned: list[float] = []
             for beside in _BESIDE_HEIGHTS:
@@ -669,11 +676,10 @@ class _DenseSegment:
                 found = matcher.matched(pairs, self.solver.rng)
                 alike = [other.earlier for other in found if other.match >= _TELLS * r.match]
                 if not alike:
-                    return True
+                    return replace(closure, decided=True, alike=False)
                 turned += np.abs(heading[alike] - heading[r.earlier]).tolist()
-            if max(turned) < _STRAIGHT_RAD:
-                return True
-        return False
+            decided = decided or max(turned) < _STRAIGHT_RAD
+        return replace(closure, decided=decided, alike=True)
 
     def grown(
         self, poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], matched: list[Revisit]

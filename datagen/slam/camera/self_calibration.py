@@ -115,7 +115,7 @@ class FoundCamera:
 
     @property
     def closed(self) -> bool:
-        """Whether a loop was closed that tells how long a lap is."""
+        """Whether a loop was closed that tells how far a lap turns."""
         return self.solved.ties_camera
 
     @property
@@ -132,6 +132,7 @@ class FoundCamera:
             "candidates": [c.figures for c in self.candidates],
             "sigma": self.sigma,
             "closed": self.closed,
+            "alike": self.solved.alike,
             "height_given": self.height_given,
             "strain": self.strain,
         }

@@ -116,9 +116,9 @@ def joined_twice(
         revisits: Revisits.
         camera_height_cm: Sets the scale.
     """
-    path, pair = path_lengths(poses), np.array([(part[r.earlier], part[r.later]) for r in revisits])
-    kept = list(revisits)
-    for a, b in np.unique(np.sort(pair[pair[:, 0] != pair[:, 1]], axis=1), axis=0).tolist():
+    path, kept = path_lengths(poses), list(revisits)
+    pairs = {(int(min(ends)), int(max(ends))) for ends in ((part[r.earlier], part[r.later]) for r in kept)}
+    for a, b in sorted(pair for pair in pairs if pair[0] != pair[1]):
         these = [r for r in kept if {int(part[r.earlier]), int(part[r.later])} == {a, b}]
         at = [r.later if part[r.later] == b else r.earlier for r in these]
         if count_places(path[at], camera_height_cm) < _LEAST_PLACES:

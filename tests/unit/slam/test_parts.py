@@ -13,7 +13,7 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.commands import BREAK_PERIODS, commands_of, habitual_pauses
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.parts import connected, placing_revisits, tied_frames
+from datagen.slam.loops.parts import connected, joined_twice, placing_revisits, tied_frames
 from datagen.slam.loops.pose_graph import close_loops, loop_pairs
 from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from datagen.slam.segment import SegmentSolver, SolvedSegment
@@ -136,6 +136,17 @@ def test_revisits_of_one_place_alone_place_nothing():
     poses, part, right = _two_parts()
     # All lie within a few frames, as where a printed road repeats itself once.
     assert placing_revisits(poses, part, [replace(right[0], later=30 + k) for k in range(4)], 15.0) == []
+
+
+def test_parts_that_one_place_joins_stay_apart_unless_others_join_them():
+    poses, _, right = _two_parts()
+    part = np.repeat([0, 1, 2], [15, 15, 30])
+    single = right[-1:]
+    assert joined_twice(poses, part, [*right[:4], *single], 15.0) == right[:4]
+    # Parts 0 and 1 hang together by several places, and so the place of part 1 agrees with those of part 0.
+    between = [Revisit(k, 15 + k, relative_pose(poses[k], poses[15 + k]), 0.8) for k in range(0, 15, 3)]
+    for kept in ([*right[:4], *single, *between], right, []):
+        assert joined_twice(poses, part, kept, 15.0) == kept
 
 
 def test_of_two_corridors_that_look_alike_it_is_the_one_where_the_car_was():
