@@ -107,12 +107,10 @@ _BESIDE_HEIGHTS, _TELLS = (4.0, 8.0, 12.0), 0.75
 #: Heading by which places beside each other on a straight may differ, [rad]. Chosen: below that of a circle
 #: of 40 camera heights, 12 of them further on.
 _STRAIGHT_RAD = 0.3
-#: Ratio of the misfits of another way around and of the best one, up to which the other explains the images
-#: as well. Measured on rings of tiles: 1.5 and more beside the true one, 1.03 to 1.14 where both were false.
-_NEAR = 1.25
-#: Heading that their odometry may miss beyond that of the likeliest, in sigmas of a known camera. Chosen:
-#: three sigmas; on a ring whose loops were closed rightly, the rivals' missed 10 and 11.
-_MORE_MISSED = 3.0
+#: Difference of the costs of another way around and of the best one, up to which the lens may be either's.
+#: Measured on rings of tiles, with the camera of the start right: 25 and more beside the true one; where the
+#: false one won, 0 to 10.
+_NEAR = 20.0
 #: Closures by different ways around whose camera is adjusted. Chosen: the true one was the first or second
 #: of four rings of tiles.
 _MOST_RIVALS = 3
@@ -642,13 +640,8 @@ class _DenseSegment:
             len(self.part) * misfit + one.bundle.prior for one, misfit in zip(rivals, agree, strict=True)
         ]
         costs = np.add(explain, [self.beside_images(one, opened) for one in rivals])
-        missed = [self.missed(one, opened, _DRIFT_RAD) for one in rivals]
         best, *others = np.argsort(costs).tolist()
-        near = [
-            rivals[k].bundle.camera
-            for k in (best, *others)
-            if explain[k] <= _NEAR * explain[best] and missed[k] <= missed[best] + _MORE_MISSED
-        ]
+        near = [rivals[k].bundle.camera for k in (best, *others) if costs[k] <= costs[best] + _NEAR]
         chosen = rivals[best].bundle
         camera = chosen.camera
         apart = {
