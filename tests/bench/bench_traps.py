@@ -17,6 +17,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,6 +26,11 @@ from trap_drives import KINDS, TrapDrive, beyond_lines, drive_settings
 from datagen.labels.truth import true_lines
 from datagen.pipeline import MapRequest, map_drive
 from datagen.settings import MapSettings
+from datagen.slam import track
+from datagen.slam.filter.dp_slam import Trajectory
+from datagen.slam.filter.motion import MotionModel
+from datagen.slam.odometry.odometry import Odometry
+from datagen.slam.odometry.scans import Scans
 from datagen.world.road.track import read_track
 from lanenet.data.drives import read_truth
 from lanenet.data.maps.folder import read_map
@@ -99,16 +105,16 @@ def beside_paint(folder: Path, drive: Path, camera: Camera) -> float | None:
     Returns:
         None without labels, or on a road whose lines are not along its track.
     """
-    truth, track, frames = read_truth(drive), read_track(drive / "track.json"), read_map_frames(folder)
+    truth, road, frames = read_truth(drive), read_track(drive / "track.json"), read_map_frames(folder)
     assert truth is not None
     index = read_map(folder).frames
     ahead_cm = np.broadcast_to(np.tile(np.array(ROWS_CM), len(SIDES)), frames.points_cm.shape)
     points_cm = np.stack([frames.points_cm, ahead_cm], axis=2)
-    lines = [track.line_beside(0.0, track.length_cm, m.offset_cm) for m in track.markings]
+    lines = [road.line_beside(0.0, road.length_cm, m.offset_cm) for m in road.markings]
     if not lines or not np.isfinite(frames.points_cm).any():
         return None
     beside, total = 0, 0
-    trees = [(cKDTree(line), 0.5 * m.width_cm) for line, m in zip(lines, track.markings, strict=True)]
+    trees = [(cKDTree(line), 0.5 * m.width_cm) for line, m in zip(lines, road.markings, strict=True)]
     for k, points in zip(index, points_cm, strict=True):
         seen = points[np.isfinite(points).all(axis=1)]
         seen = camera.intersect_ground(frames.camera.project_ground(seen))
@@ -171,8 +177,17 @@ def simulated(drive: TrapDrive, folder: Path, number: int) -> tuple[Path, Path]:
     return path, path if drive.known else blind
 
 
-def judge(kind: str, number: int, folder: Path, seed: int) -> dict[str, Any]:
-    """Simulate a drive if it is not there yet, map it, and compare with its truth."""
+def odometry_alone(scans: Scans, motion: MotionModel, *_: Any) -> Trajectory:
+    """Stand in for ``run_filter`` of :mod:`datagen.slam.track`: add up the odometry's steps."""
+    n = len(scans)
+    steps = Odometry(motion.distance_cm, motion.curvature_per_cm * motion.distance_cm)
+    return Trajectory(steps.poses, np.ones(n), np.full(n, np.nan), np.zeros(n))
+
+
+def judge(kind: str, number: int, folder: Path, seed: int, filtered: bool = True) -> dict[str, Any]:
+    """Simulate a drive if it is not there yet, map it, with or without filter, and compare with its truth."""
+    if not filtered:
+        patch.object(track, "run_filter", odometry_alone).start()
     made = KINDS[kind].make(number, seed)
     wheelbase_cm, lane_cm = made.settings.car.wheelbase_cm, made.settings.track.lane_width_cm
     drive, source = simulated(made, folder, number)
@@ -245,6 +260,9 @@ def main() -> None:
     parser.add_argument("--drives", help="first:last, or numbers with commas; all of the kind if left out")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument(
+        "--without-filter", action="store_true", help="track by odometry alone; needs another folder"
+    )
+    parser.add_argument(
         "--seed", type=int, default=SEED, help="of drive 0; another seed needs another folder"
     )
     args = parser.parse_args()
@@ -260,7 +278,11 @@ def main() -> None:
     done = {int(row["drive"]) for row in rows}
     with ProcessPoolExecutor(args.processes) as pool:
         for job in as_completed(
-            [pool.submit(judge, args.kind, n, args.folder, args.seed) for n in numbers if n not in done]
+            [
+                pool.submit(judge, args.kind, n, args.folder, args.seed, not args.without_filter)
+                for n in numbers
+                if n not in done
+            ]
         ):
             rows.append(dict.fromkeys(COLUMNS, "") | job.result())
             with table.open("a", newline="") as file:
