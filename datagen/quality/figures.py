@@ -118,7 +118,9 @@ def map_evidence(
         wrong_share=quality.wrong_share,
         revisits=revisits,
         laps=max(meta.laps, int(np.ptp(drive_map.poses[:, 2]) / (2.0 * np.pi))),
-        comes_round=segments[int(np.argmax(frames))]["closed"] and not calibration.get("alike", False),
+        comes_round=segments[int(np.argmax(frames))]["closed"]
+        and 2 * frames.max() > frames.sum()
+        and not calibration.get("alike", False),
         closure_across_heights=across_cm / revisits / height_cm if revisits else None,
         sigma={} if known else calibration["sigma"],
         # Reports of earlier versions do not know.

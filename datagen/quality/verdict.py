@@ -86,11 +86,11 @@ class MapEvidence:
         strain: Distance of a found camera's principal point and roll from those of ordinary ones, and of its
             odometry from the closed loops, in sigmas.
         alike: Whether places were seen twice, but do not tell how long a lap is.
-        elsewhere: Frames outside the largest segment, which show no place of it.
+        elsewhere: Frames outside the largest segment, which are not joined to it.
         pauses: How often the recording pauses, if it does so again and again.
         wrong_share: Share of the lines' length in sections that the images contradict.
         wrong: These sections, in words.
-        comes_round: Whether the road of the largest segment certainly ends where it begins.
+        comes_round: Whether the largest segment has most frames, and its road certainly ends where it begins.
         bend_lane_cm: Width of the lane in bends, if it is another one there; else None.
         open_lane_cm: Narrowest and widest tenth of a lane of many widths that has no straight; else None.
         outer_lane_cm: Lane width that the user gave, if the lines that are so far apart bound several lanes,
@@ -347,7 +347,7 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
         return "wrong in sections", f", of which the longest is {e.wrong[0]}" if e.wrong else ""
     if not e.revisits or e.alike:
         return "open", ": how long a lap is stays open" if e.alike else ": no place was certainly seen twice"
-    apart = f", but for {counted(e.elsewhere, 'frame')} that show no place of it" if e.elsewhere else ""
+    apart = f", but for {counted(e.elsewhere, 'frame')} that are not joined to it" if e.elsewhere else ""
     return ("closed", apart) if e.comes_round else ("open", f": nothing certainly closes the lap{apart}")
 
 

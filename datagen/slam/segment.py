@@ -507,9 +507,7 @@ class _DenseSegment:
             for group in rivals:
                 if otherwise and any(_go_around_alike(path_cm, group, one.revisits) for one in found):
                     continue
-                grown = joined_twice(
-                    opened.poses, self.part, self.grown(opened.poses, group, matched), self.height
-                )
+                grown = self.grown(opened.poses, group, matched)
                 # The same pairs with other whole turns between them are another way around.
                 key = tuple(sorted((r.earlier, r.later, r.turns) for r in grown))
                 if key in tried or len(grown) < self.revisit_settings.min_revisits:
@@ -523,8 +521,12 @@ class _DenseSegment:
         for one in sorted(found, key=lambda closure: self.cost(closure, opened)):
             if not any(_go_around_alike(path_cm, one.revisits, other.revisits) for other in chosen):
                 chosen.append(one)
-        most = _MOST_RIVALS if self.find_camera else 1
-        return [self.confirmed_closure(one, opened, matched) for one in chosen[:most]]
+        if self.find_camera:
+            costs = self.costs(chosen, opened)
+            chosen = [chosen[k] for k in np.argsort(costs)[:_MOST_RIVALS]]
+        else:
+            chosen = chosen[:1]
+        return [self.confirmed_closure(one, opened, matched) for one in chosen]
 
     def confirmed_closure(self, closure: _Closure, opened: BundleResult, matched: list[Revisit]) -> _Closure:
         """Close the loops again where the adjusted map tells better which revisits are true.
@@ -612,8 +614,9 @@ class _DenseSegment:
         moved = carried(closure.bundle.poses, breaks, self.height)
         joins = len(np.unique(self.part)) - len(np.unique(group))
         other = float(np.log(closure.bundle.camera.K[0, 0] / opened.camera.K[0, 0]))
-        missed = self.missed(closure, opened, float(np.hypot(_DRIFT_RAD, _DRIFT_OF_LENS_RAD * other)))
-        return 0.5 * missed**2 + moved - JOINED * joins
+        drift_rad = float(np.hypot(_DRIFT_RAD, _DRIFT_OF_LENS_RAD * other))
+        missed = self.missed(closure, opened, drift_rad)
+        return 0.5 * missed**2 + float(np.log(drift_rad / _DRIFT_RAD)) + moved - JOINED * joins
 
     def missed(self, closure: _Closure, opened: BundleResult, drift_rad: float) -> float:
         """Heading that odometry misses in a lap of a closure, in sigmas, of which its drift is one part."""
@@ -625,21 +628,27 @@ class _DenseSegment:
         gaps = float(np.sum((periods > 1.0) & (periods <= MOST_BRIDGED))) / laps
         return abs(heading_drift(opened.poses, within)[1]) / float(np.hypot(drift_rad, gaps**0.5 * _GAP_RAD))
 
-    def likeliest_first(self, rivals: Sequence[_Closure], opened: BundleResult) -> list[_Closure]:
-        """Order closures that go around by other ways by their likelihood.
+    def costs(self, rivals: Sequence[_Closure], opened: BundleResult) -> list[float]:
+        """Negative log likelihoods of closures that go around by other ways.
 
         What counts is how well the pairs of frames agree that each of them compares, how unlike ordinary ones
-        the camera is that it needs, and what counts between closures that go around alike. The motion's
-        priors do not: of the closure that ties the most laps they expect too much. On a circle every way
-        around may do, with a camera for each.
+        the camera is that it needs, and what counts beside images. The motion's priors do not: of the closure
+        that ties the most laps they expect too much. On a circle every way around may do, with a camera for
+        each.
         """
+        if not rivals:
+            return []
+        agree = shared_misfits([one.bundle for one in rivals])
+        return [
+            len(self.part) * misfit + one.bundle.prior + self.beside_images(one, opened)
+            for one, misfit in zip(rivals, agree, strict=True)
+        ]
+
+    def likeliest_first(self, rivals: Sequence[_Closure], opened: BundleResult) -> list[_Closure]:
+        """Order closures that go around by other ways by their likelihood, and note what the first tells."""
         if not rivals or not self.find_camera:
             return list(rivals)
-        agree = shared_misfits([one.bundle for one in rivals])
-        explain = [
-            len(self.part) * misfit + one.bundle.prior for one, misfit in zip(rivals, agree, strict=True)
-        ]
-        costs = np.add(explain, [self.beside_images(one, opened) for one in rivals])
+        costs = self.costs(rivals, opened)
         best, *others = np.argsort(costs).tolist()
         near = [rivals[k].bundle.camera for k in (best, *others) if costs[k] <= costs[best] + _NEAR]
         chosen = rivals[best].bundle
@@ -665,7 +674,8 @@ class _DenseSegment:
             turned: list[float] = []
             for beside in _BESIDE_HEIGHTS:
                 at_cm = path[r.earlier] + np.array([-1.0, 1.0]) * beside * self.height
-                pairs = [(int(k), r.later) for k in np.searchsorted(path, at_cm) if k < r.later]
+                at = np.searchsorted(path, at_cm[at_cm >= 0.0])
+                pairs = [(int(k), r.later) for k in at if k < r.later]
                 found = matcher.matched(pairs, self.solver.rng)
                 alike = [other.earlier for other in found if other.match >= _TELLS * r.match]
                 if not alike:
@@ -678,6 +688,7 @@ class _DenseSegment:
         self, poses: Float[np.ndarray, "n 3"], revisits: list[Revisit], matched: list[Revisit]
     ) -> list[Revisit]:
         """Close the loops with what the closed poses confirm and what places more parts, in rounds."""
+        revisits = joined_twice(poses, self.part, revisits, self.height)
         for _ in range(_MOST_GROWTH):
             closed, _ = close_loops(poses, revisits, self.height, self.view.commands.periods)
             confirmed = self.confirmed(closed, matched)
@@ -689,7 +700,7 @@ class _DenseSegment:
     def confirmed(self, poses: Float[np.ndarray, "n 3"], matched: list[Revisit]) -> list[Revisit]:
         """Revisits that a closed map confirms, and those that place parts on it that it lacks."""
         turned = [replace(r, turns=whole_turns(poses, r)) for r in matched]
-        inliers = inlier_revisits(poses, turned, self.height)
+        inliers = joined_twice(poses, self.part, inlier_revisits(poses, turned, self.height), self.height)
         group = connected(self.part, inliers)
         placing = placing_revisits(poses, group, turned, self.height)
         return sorted([*inliers, *placing], key=lambda r: (r.later, r.earlier))
