@@ -427,8 +427,7 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     if e.alike:
         why = ", for the road looks alike in more than one place: how long a lap is stays open"
     remedy = f"{laps if few and not e.alike else ''}{_CAMERA_FILE}"
-    if e.given_height_cm is None:
-        remedy += ", or its height (--camera-height)"
+    height = ", or its height (--camera-height)" if e.given_height_cm is None else ""
     if e.closure_across_heights is not None:
         yield Check(
             "max_closure_heights", "revisits miss each other across the road by {} (median)",
@@ -449,7 +448,8 @@ def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     ):
         yield Check(
             name, f"the drive leaves the camera's {what} open by {{}}", e.sigma.get(key, 0.0), bound,
-            s.usable * bound, f"the drive does not show the camera's {what} well enough{why}", remedy, unit,
+            s.usable * bound, f"the drive does not show the camera's {what} well enough{why}",
+            remedy + height if key == "focal" else remedy, unit,
         )  # fmt: skip
 
 
@@ -465,8 +465,7 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     if e.found_lane_cm is not None:
         beyond = s.usable * s.lane_mismatch
         yield _compared("lane_mismatch", "lane", e.found_lane_cm, e.given_lane_cm, s.lane_mismatch, beyond)
-        return
-    if e.open_lane_cm is not None:
+    elif e.open_lane_cm is not None:
         low, high = e.open_lane_cm
         yield Check(
             "open_cm", "the widest tenth of the lane is wider than the narrowest by {}, and no straight is "
@@ -474,13 +473,14 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
             f"the lane is {low:.0f} to {high:.0f} cm wide and has no straight, so it is open which width is "
             f"{e.given_lane_cm:g} cm", "give a camera file (--camera), or drive a road that has a straight",
         )  # fmt: skip
-    if (asked := _other_width(e, s)) is not None:
+    if e.found_lane_cm is None and (asked := _other_width(e, s)) is not None:
         yield asked
     made = (
         f"with a lane width of {e.given_lane_cm:.4g} cm, the camera would be {e.height_cm:.0f} cm high and "
         f"the tape {e.tape_cm:.1f} cm wide, which cannot be"
     )
-    for bound, what, value, _, _, (least, most) in lengths:
+    # The height of a known camera is as it is.
+    for bound, what, value, _, _, (least, most) in lengths[e.found_lane_cm is not None :]:
         end = least if value < least else most
         yield Check(
             bound, f"the {what} follows as {{}}", value, end, end, made, _WHICH_WIDTH, "cm", value < least

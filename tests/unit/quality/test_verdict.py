@@ -133,8 +133,8 @@ def test_what_the_user_set_moves_the_bounds():
 def test_lengths_that_cannot_be_are_rejected_and_the_lane_width_is_asked_for(made):
     verdict = judged(**made)
     assert verdict.grade == "reject" and "is the lane width right?" in verdict.sentence.lower()
-    # A camera whose height is known says itself how wide the lane is.
-    assert off(KNOWN, **made) == {}
+    # A camera whose height is known says itself how wide the lane is; tape is no wider for it.
+    assert off(KNOWN, **made) == ({"tape_cm": "reject"} if made.get("tape_cm") == 12.0 else {})
 
 
 @pytest.mark.parametrize(
