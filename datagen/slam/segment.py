@@ -181,12 +181,6 @@ class SolvedSegment:
         """Revisits between whose visits the drive was recorded without a long gap."""
         return [r for r in self.revisits if self.part[r.earlier] == self.part[r.later]]
 
-    @property
-    def drift_rad_per_cm(self) -> float | None:
-        """Heading drift of the open loop per length; None without a revisit within a part."""
-        within = self.revisits_within_parts
-        return heading_drift(self.open_poses, within)[0] if within else None
-
     def only(self, chosen: Int[np.ndarray, "m"]) -> SolvedSegment:
         """Return some of its frames, which no revisit joins to the others.
 
@@ -211,13 +205,12 @@ class SolvedSegment:
         )
 
 
-def heading_drift(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> tuple[float, float]:
-    """Heading that an open loop misses per length, [rad/cm], and in one lap, [rad]; medians over revisits."""
+def heading_drift(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> float:
+    """Heading that an open loop misses in one lap, [rad]; from medians over revisits."""
     path, heading = path_lengths(poses), poses[:, 2]
     between = np.array([path[r.later] - path[r.earlier] for r in revisits])
     missed = [heading[r.later] - heading[r.earlier] - r.relative[2] - 2.0 * np.pi * r.turns for r in revisits]
-    rate = float(np.median(missed / between))
-    return rate, rate * float(np.median(between[of_one_lap(between)]))
+    return float(np.median(missed / between)) * float(np.median(between[of_one_lap(between)]))
 
 
 def count_laps(path_cm: Float[np.ndarray, "n"], revisits: list[Revisit]) -> Int[np.ndarray, "n"]:
@@ -626,7 +619,7 @@ class _DenseSegment:
         periods = self.view.commands.periods
         laps = max(float(np.ptp(opened.poses[:, 2])) / (2.0 * np.pi), 1.0)
         gaps = float(np.sum((periods > 1.0) & (periods <= MOST_BRIDGED))) / laps
-        return abs(heading_drift(opened.poses, within)[1]) / float(np.hypot(drift_rad, gaps**0.5 * _GAP_RAD))
+        return abs(heading_drift(opened.poses, within)) / float(np.hypot(drift_rad, gaps**0.5 * _GAP_RAD))
 
     def costs(self, rivals: Sequence[_Closure], opened: BundleResult) -> list[float]:
         """Negative log likelihoods of closures that go around by other ways.

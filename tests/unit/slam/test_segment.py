@@ -15,7 +15,7 @@ from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.filter.dp_slam import FilterSettings
 from datagen.slam.loops.pose_graph import loop_pairs, neighbouring_laps, revisit_residuals
 from datagen.slam.loops.revisits import Revisit, RevisitSettings
-from datagen.slam.segment import SegmentSolver, SolvedSegment, count_laps
+from datagen.slam.segment import SegmentSolver, SolvedSegment, count_laps, heading_drift
 from datagen.world.simulate import simulate_drive
 from datagen.world.world import SimulationSettings
 from lanenet.data.drives import open_drive, read_truth
@@ -104,13 +104,12 @@ def test_revisits_are_a_lap_apart_and_meet(solved):
         assert revisit.turns == 1
     missed = np.median(np.abs(revisit_residuals(segment.poses, segment.revisits)), axis=0)
     assert missed[:2].max() < 1.0 and missed[2] < np.deg2rad(1.0)
-    assert segment.drift_rad_per_cm is not None
     missed_rad = [
         segment.open_poses[r.later, 2] - segment.open_poses[r.earlier, 2] - r.relative[2] - 2.0 * np.pi
         for r in segment.revisits
     ]
-    drift = float(np.median(missed_rad)) / LAP_CM
-    assert segment.drift_rad_per_cm == pytest.approx(drift, abs=np.deg2rad(10.0) / LAP_CM)
+    drift = heading_drift(segment.open_poses, segment.revisits)
+    assert drift == pytest.approx(float(np.median(missed_rad)), abs=np.deg2rad(1.0))
     # A frame lies where the lap ends: the last bits decide which side of it that is.
     clear = np.abs(segment.path_cm - LAP_CM) > 0.5 * LAP_CM / LAP_FRAMES
     assert clear.sum() >= len(clear) - 1
@@ -134,7 +133,7 @@ def test_one_lap_stays_open():
     follow, adjust = ([step[1:] for step in told if step[0] == name] for name in dict(s[:2] for s in told))
     assert [s[0] for s in told] == ["follow the drive, %"] * len(follow) + ["adjust poses"] * len(adjust)
     assert follow[-1] == (100, 100) and adjust == [(0, 3), (1, 3), (2, 3), (3, 3)]
-    assert segment.revisits == [] and segment.drift_rad_per_cm is None
+    assert segment.revisits == []
     assert not segment.laps.any()
     np.testing.assert_array_equal(segment.poses, segment.open_poses)
     # Open, and with few dashes in so short a drive, the length is known to a sixth or so, whatever the seed.
