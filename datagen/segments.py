@@ -290,10 +290,13 @@ def fit_lanes(
     mapped: list[MappedSegment] = []
     failed: list[Refused] = []
     lane_cm, dark = prepared.known_lane_cm, None
+    # A narrower one would make a camera or tape of the given lane that the verdict calls impossible.
+    told_cm, sizes = prepared.request.lane_width_cm, settings.verdict
+    least = told_cm / sizes.height_cm[1], told_cm / sizes.tape_cm[1]
     for segment in sorted(segments, key=lambda one: -len(one.rows)):
         rows = segment.rows
         try:
-            one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit, dark)
+            one = find_lane(segment, lane_cm, held_out[rows], settings.trace, settings.fit, dark, least)
             check_lane(one, drive)
         except (TrackingLostError, CalibrationError) as error:
             failed.append(Refused(rows, error))

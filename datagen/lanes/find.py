@@ -78,6 +78,7 @@ def find_lane(
     trace: TraceSettings,
     fit: FitSettings,
     dark: bool | None = None,
+    least: tuple[float, float] = (0.0, 0.0),
 ) -> MappedSegment:
     """Find a segment's lane lines, in the scale of its camera.
 
@@ -88,6 +89,7 @@ def find_lane(
         trace: How lane lines are traced.
         fit: How cubics are fitted to them.
         dark: Whether the markings are darker than the floor; None if unknown.
+        least: Narrowest lane that is found, see :func:`datagen.lanes.markings.find_lane_width`.
 
     Raises:
         TrackingLostError: If no two lines run along the drive.
@@ -108,7 +110,7 @@ def find_lane(
     edges = edges.towards_dark() if dark else edges
     free_cm = None
     if lane_width_cm is None:
-        lane = trace_lane(path, edges, height, None, trace)
+        lane = trace_lane(path, edges, height, None, trace, least)
     else:
         lane, free_cm = trace_known_lane(path, edges, height, lane_width_cm, trace)
     several = free_cm == lane.lane_cm

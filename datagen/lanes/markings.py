@@ -248,13 +248,17 @@ def _best_pairs(profile: EdgeProfile, width_cm: float, driven: int) -> Samples:
     return np.asarray(np.partition(profile.tapes(width_cm)[:driven], -6, axis=1)[:, -6:].mean(axis=1))
 
 
-def find_lane_width(markings: Markings, driven: int, camera_height_cm: float) -> float:
+def find_lane_width(
+    markings: Markings, driven: int, camera_height_cm: float, least: tuple[float, float] = (0.0, 0.0)
+) -> float:
     """Find the distance at which two markings run along the path, one on either side of the car.
 
     Args:
         markings: Where markings may lie.
         driven: Number of path samples that the car has driven over.
         camera_height_cm: Sets the scale of bounds.
+        least: Narrowest lane, in camera heights and in widths of a marking; a narrower one counts if there is
+            no other.
 
     Raises:
         TrackingLostError: If no two lines run side by side.
@@ -273,6 +277,8 @@ def find_lane_width(markings: Markings, driven: int, camera_height_cm: float) ->
     peaks = [i for i in range(1, len(score) - 1) if score[i] >= score[i - 1] and score[i] > score[i + 1]]
     if not peaks:
         raise TrackingLostError("no two lines run side by side along the drive, so its scale is unknown")
+    least_cm = max(least[0] * camera_height_cm, least[1] * markings.tape_cm)
+    peaks = [i for i in peaks if widths[i] >= least_cm] or peaks
     peaks.sort(key=lambda i: -score[i])
     best = peaks[0]
     for other in peaks[1:]:

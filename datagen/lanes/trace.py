@@ -93,6 +93,7 @@ def trace_lane(
     camera_height_cm: float,
     lane_width_cm: float | None,
     settings: TraceSettings,
+    least: tuple[float, float] = (0.0, 0.0),
 ) -> TracedLane:
     """Find the lines that bound the driven lane.
 
@@ -102,6 +103,7 @@ def trace_lane(
         camera_height_cm: Sets the scale of cells and bounds.
         lane_width_cm: Distance between the lines; None if it is to be found.
         settings: Cell sizes and bounds.
+        least: Narrowest lane that is found, see :func:`find_lane_width`.
 
     Raises:
         TrackingLostError: If no pair of lines runs along the path.
@@ -111,7 +113,7 @@ def trace_lane(
     tape = find_tape_width(profile, driven, camera_height_cm, settings)
     markings = Markings(path, profile, tape, settings)
     if lane_width_cm is None:
-        lane_width_cm = find_lane_width(markings, driven, camera_height_cm)
+        lane_width_cm = find_lane_width(markings, driven, camera_height_cm, least)
     lane, centre = markings.best_lane(lane_width_cm)
     band = settings.width_share * lane
     left, right = (

@@ -361,20 +361,21 @@ class _Closure:
 
 
 def _go_around_alike(path_cm: Float[np.ndarray, "n"], one: list[Revisit], other: list[Revisit]) -> bool:
-    """Whether the laps by two sets of revisits are as long, and turn as often.
+    """Whether the laps by two sets of revisits are alike, or those of one are several of the other.
 
     Args:
         path_cm: Length of the open loop up to each frame.
         one: Revisits.
         other: Others.
     """
-    lengths, turns = [], []
+    laps = []
     for revisits in (one, other):
         between_cm = np.array([path_cm[r.later] - path_cm[r.earlier] for r in revisits])
-        once = of_one_lap(between_cm)
-        lengths.append(float(np.median(between_cm[once])))
-        turns.append(float(np.median(np.array([r.turns for r in revisits])[once])))
-    return bool(abs(np.log(lengths[0] / lengths[1])) < _OTHER_LAP and turns[0] == turns[1])
+        once, turns = of_one_lap(between_cm), np.array([r.turns for r in revisits])
+        laps.append((float(np.median(between_cm[once])), float(np.median(turns[once]))))
+    (short_cm, short_turns), (long_cm, long_turns) = sorted(laps)
+    times = max(round(long_cm / short_cm), 1)
+    return abs(np.log(long_cm / (times * short_cm))) < _OTHER_LAP and long_turns == times * short_turns
 
 
 def shared_misfits(bundles: Sequence[BundleResult]) -> list[float]:
@@ -496,14 +497,19 @@ class _DenseSegment:
         found: list[_Closure] = []
         tried: set[tuple[tuple[int, int, int], ...]] = set()
         path_cm = path_lengths(opened.poses)
+        least = self.revisit_settings.min_revisits
+
+        def is_known(revisits: list[Revisit]) -> bool:
+            return any(_go_around_alike(path_cm, revisits, one.revisits) for one in found)
+
         for rivals, otherwise in self.sets_to_try(opened.poses, matched):
             for group in rivals:
-                if otherwise and any(_go_around_alike(path_cm, group, one.revisits) for one in found):
+                if otherwise and is_known(group):
                     continue
                 grown = self.grown(opened.poses, group, matched)
                 # The same pairs with other whole turns between them are another way around.
                 key = tuple(sorted((r.earlier, r.later, r.turns) for r in grown))
-                if key in tried or len(grown) < self.revisit_settings.min_revisits:
+                if key in tried or len(grown) < least or (otherwise and is_known(grown)):
                     continue
                 tried.add(key)
                 closure = self.try_closure(grown, opened)

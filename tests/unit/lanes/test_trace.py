@@ -115,7 +115,13 @@ def test_the_lane_width_is_found(lane_cm):
     assert lane.lane_cm == pytest.approx(lane_cm, abs=2.0 * CELL_CM)
 
 
-def _road_of_two_lanes(seed: int, middle: np.ndarray, dashed: bool = True, specks: int = 120) -> TracedLane:
+def _road_of_two_lanes(
+    seed: int,
+    middle: np.ndarray,
+    dashed: bool = True,
+    specks: int = 120,
+    least: tuple[float, float] = (0.0, 0.0),
+) -> TracedLane:
     """Two lines 60 cm apart, with dashes in the middle or none, on a mottled floor; nobody says how wide."""
     rng = np.random.default_rng(seed)
     path = _path()
@@ -126,7 +132,7 @@ def _road_of_two_lanes(seed: int, middle: np.ndarray, dashed: bool = True, speck
         parts.append(_tape(rng, middle, _dashed(path, 22.0)))
     places = zip(rng.uniform(0.0, path.s_cm[-1], specks), rng.uniform(-27.0, 27.0, specks), strict=True)
     parts += [_tape(rng, middle + d, np.abs(path.s_cm - s) < 2.5) for s, d in places]
-    return trace_lane(path, _edges(*parts), HEIGHT_CM, None, SETTINGS)
+    return trace_lane(path, _edges(*parts), HEIGHT_CM, None, SETTINGS, least)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -145,6 +151,9 @@ def test_a_car_that_keeps_to_one_half_of_a_road_has_it_for_its_lane(seed, side):
     lane = _road_of_two_lanes(seed, middle)
     assert lane.lane_cm == pytest.approx(30.0, abs=1.5)
     assert np.median(np.abs(lane.centre_cm - (middle - side * 15.0))) < 1.0
+    # Unless the told width would make a camera or tape of it that cannot be.
+    for least in ((33.0 / HEIGHT_CM, 0.0), (0.0, 33.0 / lane.tape_cm)):
+        assert _road_of_two_lanes(seed, middle, least=least).lane_cm == pytest.approx(60.0, abs=1.5)
 
 
 @pytest.mark.parametrize("amplitude_cm", [0.0, 12.0, 25.0])
