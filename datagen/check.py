@@ -20,7 +20,7 @@ from datagen.quality.residuals import Residuals, coverage, held_out_residuals, r
 from datagen.quality.verdict import Verdict, judge
 from lanenet.data.drives import Drive
 from lanenet.data.maps.mapped_drive import MappedDrive
-from lanenet.errors import TrackingLostError
+from lanenet.errors import NoLaneError
 from lanenet.geometry.lane import SIDES
 
 #: Least coverage of both lines. Chosen: dashes and worn lines have more.
@@ -62,7 +62,7 @@ def check_map(prepared: PreparedDrive, assembled: AssembledMap, camera_figures: 
         camera_figures: Those of the camera, where it was found or refined on this drive.
 
     Raises:
-        TrackingLostError: If held-out frames do not show the lines.
+        NoLaneError: If held-out frames do not show the lines.
         CalibrationError: If they show one line only, but there is a lane of another width.
     """
     drive, drive_map, free_cm = prepared.drive, assembled.drive_map, assembled.free_lane_cm
@@ -129,12 +129,12 @@ def check_lines_seen(
         free_lane_cm: Lane width found without the given one, if it fits better; else None.
 
     Raises:
-        TrackingLostError: If the frames show at most one of the lines; names the coverage.
+        NoLaneError: If the frames show at most one of the lines; names the coverage.
         CalibrationError: If they show at most one, but there is a lane of another width.
     """
     share = coverage(np.concatenate(held_out[:2]))
     if share < _LEAST_COVERAGE:
-        raise TrackingLostError(
+        raise NoLaneError(
             f"{drive.path}: no lane: held-out frames show an edge along {100.0 * share:.0f} % of the "
             f"borders of its lines, expected {100.0 * _LEAST_COVERAGE:.0f} % at least"
         )
@@ -153,7 +153,7 @@ def check_lines_seen(
         f"{100.0 * met:.0f} % of the {side} line's borders, {sd_px:.1f} px off"
         for side, (met, sd_px) in lines.items()
     )
-    raise TrackingLostError(
+    raise NoLaneError(
         f"{drive.path}: {'one line only bounds the driven lane' if len(clutter) == 1 else 'no lane'}: "
         f"held-out frames show edges along {found} (robust sd); those of the {' and the '.join(clutter)} "
         "line are met by chance"

@@ -20,11 +20,10 @@ from datagen.quality.page import report_page
 from datagen.quality.pictures import draw_contact_sheet, draw_map
 from datagen.quality.verdict import verdict_lines
 from datagen.quality.without_map import hints_without_map
-from datagen.refusal import Attempt, report_refusal
+from datagen.refusal import Attempt, remedy_of, report_refusal
 from datagen.rescale import Solved, rescaled
 from datagen.segments import camera_of_drive, fit_lanes, solve_drive
 from datagen.settings import MapSettings
-from datagen.slam.camera.self_calibration import DRIVE_INSTEAD
 from datagen.slam.segment import SegmentSolver, StageProgress
 from lanenet.config import dump_settings
 from lanenet.data.camera_file import read_camera
@@ -86,7 +85,7 @@ def map_drive(
             where = "" if str(request.drive_path) in str(error) else f"{request.drive_path}: "
             page = _refused(attempt, error, out) if pictures else ""
             hints = _hints(attempt, out) if page else ()
-            message = f"{where}{error}; {DRIVE_INSTEAD}{kept_map(out)}{page}"
+            message = f"{where}{error}; {remedy_of(error)}{kept_map(out)}{page}"
             raise TrackingLostError(message, hints=hints) from error
 
 

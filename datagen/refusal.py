@@ -21,7 +21,14 @@ from datagen.slam.segment import SolvedSegment
 from datagen.slam.view import mapping_range
 from lanenet.data.drives import Drive
 from lanenet.data.files import atomic_folder, write_text
-from lanenet.errors import CalibrationError, DriveFormatError, LanenetError, TrackingLostError, counted
+from lanenet.errors import (
+    CalibrationError,
+    DriveFormatError,
+    LanenetError,
+    NoLaneError,
+    TrackingLostError,
+    counted,
+)
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.frames import map_from_car
 from lanenet.page import (
@@ -42,6 +49,10 @@ from lanenet.page import (
 from lanenet.perception.edges.canny import find_edges
 from lanenet.perception.edges.road import RoadTable
 
+#: What to do where no lane was found; how many laps were driven does not matter then.
+_SEE_LINES = (
+    "drive between two lines that the camera sees, and give the distance between their middles (--lane-width)"
+)
 #: The report beside an older map, which a refusal does not replace.
 BESIDE_MAP_NAME = "report-refused.html"
 #: What ``refused.yaml`` says of its folder.
@@ -140,11 +151,16 @@ def refusal_page(attempt: Attempt, error: LanenetError, out: Path) -> str:
     return page_of(f"No map of {drive.name}", "refused", cause, body)
 
 
+def remedy_of(error: TrackingLostError) -> str:
+    """Tell what to do about a drive that does not determine a map."""
+    return _SEE_LINES if isinstance(error, NoLaneError) else DRIVE_INSTEAD
+
+
 def _cause_and_remedy(error: LanenetError, drive: Drive) -> tuple[str, str]:
     """Tell what an error found from what it advises, which is "" where it advises nothing by itself."""
     reason = str(error).removeprefix(f"{drive.path}: ")
     if isinstance(error, TrackingLostError):
-        return reason, DRIVE_INSTEAD
+        return reason, remedy_of(error)
     if isinstance(error, CalibrationError):
         # Where it advises something, that is what its last semicolon is for.
         cause, semicolon, advice = reason.rpartition("; ")

@@ -112,6 +112,10 @@ class TrackingLostError(LanenetError):
     """The drive does not determine a map."""
 
 
+class NoLaneError(TrackingLostError):
+    """No two lines along the drive bound a lane."""
+
+
 class ModelMismatchError(LanenetError):
     """A model is for another camera, window or format."""
 

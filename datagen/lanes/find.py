@@ -26,7 +26,7 @@ from datagen.lanes.widths import marking_widths
 from datagen.slam.segment import SolvedSegment
 from lanenet.data.drives import Drive
 from lanenet.data.maps.line import LaneLine
-from lanenet.errors import TrackingLostError
+from lanenet.errors import NoLaneError
 from lanenet.geometry.lane import SIDES
 
 #: Distance ahead of a frame up to which its edges count in any case, in lane widths. Derived: in a wide lane,
@@ -92,7 +92,7 @@ def find_lane(
         least: Narrowest lane that is found, see :func:`datagen.lanes.markings.find_lane_width`.
 
     Raises:
-        TrackingLostError: If no two lines run along the drive.
+        NoLaneError: If no two lines run along the drive.
         CalibrationError: If two do, but at another distance than the lane width.
     """
     height = segment.camera.mounting.height_cm
@@ -141,7 +141,7 @@ def check_lane(segment: MappedSegment, drive: Drive) -> None:
     """Refuse a segment in which one of the lines is hardly seen.
 
     Raises:
-        TrackingLostError: Names the share of the path along which each line was seen.
+        NoLaneError: Names the share of the path along which each line was seen.
     """
     share: dict[str, float] = {
         line.side: float(line.supported(segment.s_frames_cm).mean())
@@ -154,6 +154,6 @@ def check_lane(segment: MappedSegment, drive: Drive) -> None:
     no_line = max(share.values()) < MAYBE_LINE or max(painted.values()) < _PAINTED
     what, shown, least = ("no line", painted, _PAINTED) if no_line else ("one line only", share, LEAST_SEEN)
     found = ", ".join(f"the {side} one along {100.0 * shown[side]:.0f} % of the path" for side in SIDES)
-    raise TrackingLostError(
+    raise NoLaneError(
         f"{drive.path}: {what} bounds the driven lane: {found}, expected {100.0 * least:.0f} % for each"
     )

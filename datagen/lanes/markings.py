@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 from datagen.lanes.path import Path, Samples
 from datagen.lanes.profile import EdgeProfile, shifted
 from lanenet.config import Settings
-from lanenet.errors import TrackingLostError
+from lanenet.errors import NoLaneError
 
 #: Ratio of two line distances at which one counts as half of the other. Chosen: widths are known to a cell of
 #: 0.06 camera heights, 3 % of a usual lane.
@@ -261,7 +261,7 @@ def find_lane_width(
             no other.
 
     Raises:
-        TrackingLostError: If no two lines run side by side.
+        NoLaneError: If no two lines run side by side.
     """
     profile, support = markings.profile, markings.support[:driven]
     low, high = (w * camera_height_cm for w in markings.settings.lane_heights)
@@ -276,7 +276,7 @@ def find_lane_width(
     score = gaussian_filter1d(np.array(scores), 1.5)
     peaks = [i for i in range(1, len(score) - 1) if score[i] >= score[i - 1] and score[i] > score[i + 1]]
     if not peaks:
-        raise TrackingLostError("no two lines run side by side along the drive, so its scale is unknown")
+        raise NoLaneError("no two lines run side by side along the drive, so its scale is unknown")
     least_cm = max(least[0] * camera_height_cm, least[1] * markings.tape_cm)
     peaks = [i for i in peaks if widths[i] >= least_cm] or peaks
     peaks.sort(key=lambda i: -score[i])

@@ -24,7 +24,7 @@ from datagen.lanes.path import Path, PathEdges, Samples
 from datagen.lanes.profile import EdgeProfile, edge_profile, long_runs
 from lanenet.data.maps.line import Side
 from lanenet.data.segments import true_runs
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.errors import CalibrationError, NoLaneError
 
 #: Deviations from the line's median offset, in lane widths: a run beyond the second is dropped as a bulge if
 #: it exceeds the first. The third is half the length of the median's window. Chosen: dashes lie on one curve,
@@ -106,7 +106,7 @@ def trace_lane(
         least: Narrowest lane that is found, see :func:`find_lane_width`.
 
     Raises:
-        TrackingLostError: If no pair of lines runs along the path.
+        NoLaneError: If no pair of lines runs along the path.
     """
     profile = _profile_along(path, edges, camera_height_cm, settings)
     driven = _driven_samples(path)
@@ -121,7 +121,7 @@ def trace_lane(
         for found in (markings.follow(centre + share * lane, band) for share in (0.5, -0.5))
     )
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
-        raise TrackingLostError(
+        raise NoLaneError(
             f"no pair of lines about {lane_width_cm:.0f} cm apart runs along the drive: check the lane width "
             "and the camera's height"
         )
@@ -140,16 +140,16 @@ def trace_known_lane(
 
     Raises:
         CalibrationError: If there is no lane of this width but one of another; names both.
-        TrackingLostError: If there is no lane.
+        NoLaneError: If there is no lane.
     """
     try:
         free: TracedLane | None = trace_lane(path, edges, height_cm, None, settings)
-    except TrackingLostError:
+    except NoLaneError:
         free = None
     lane: TracedLane | None
     try:
         lane = trace_lane(path, edges, height_cm, lane_width_cm, settings)
-    except TrackingLostError:
+    except NoLaneError:
         if free is None:
             raise
         lane = None
@@ -161,7 +161,7 @@ def trace_known_lane(
     ):
         raise other_lane(lane_width_cm, free.lane_cm)
     if lane is None:
-        raise TrackingLostError(f"no two lines {lane_width_cm:g} cm apart run along the drive")
+        raise NoLaneError(f"no two lines {lane_width_cm:g} cm apart run along the drive")
     if free is None or not _fits_better(free, lane):
         return lane, None
     within = free.lane_cm < lane.lane_cm and min(*lane.seen, *free.seen) >= MAYBE_LINE

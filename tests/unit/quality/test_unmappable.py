@@ -33,7 +33,7 @@ from lanenet.perception.edges.canny import EdgeSettings
 
 CAMERA = {"width": 160, "height": 120, "field_of_view_rad": math.radians(120.0), "height_cm": 17.0}
 SETTINGS = MapSettings(find_bumper=False)
-INSTEAD = "drive two laps of a closed track"
+INSTEAD, BETWEEN = "drive two laps of a closed track", "drive between two lines that the camera sees"
 
 
 def simulated(folder: Path, frames: int, **lines: str) -> Path:
@@ -49,17 +49,17 @@ def written(folder: Path, frames: list[np.ndarray]) -> Path:
     return folder
 
 
-def refusal(drive: Path, out: Path, lane_width_cm: float = 40.0) -> str:
+def refusal(drive: Path, out: Path, lane_width_cm: float = 40.0, remedy: str = INSTEAD) -> str:
     """Message of a drive that is not mapped; nothing may be left behind but its report."""
     with pytest.raises(TrackingLostError) as caught:
         map_drive(MapRequest(drive, lane_width_cm), SETTINGS, out)
     assert {path.name for path in out.iterdir()} == {"report.html", "refused.yaml"}
     assert not list(out.parent.glob(".*"))
     message = str(caught.value)
-    assert str(drive) in message and INSTEAD in message and str(out / "report.html") in message
+    assert str(drive) in message and remedy in message and str(out / "report.html") in message
     page = (out / "report.html").read_text(encoding="utf-8")
     assert message.split(": ", 1)[1].split(";")[0][1:] in html.unescape(page)
-    assert f"What to do:</strong> {INSTEAD.capitalize()}" in page
+    assert f"What to do:</strong> {remedy.capitalize()}" in page
     hough = f"lanenet detect {drive} --detector hough --out {out}-hough.csv"
     assert any(hough in line for line in caught.value.hints) and hough in re.sub(
         "<[^>]+>", "", html.unescape(page)
@@ -195,7 +195,7 @@ def test_a_bare_floor_has_no_edges(tmp_path):
 
 def test_one_line_only(tmp_path):
     drive = simulated(tmp_path / "drive", 80, left="none", right="solid")
-    message = refusal(drive, tmp_path / "map")
+    message = refusal(drive, tmp_path / "map", remedy=BETWEEN)
     assert "one line only" in message and "right one along 9" in message
 
 
@@ -205,7 +205,7 @@ def test_one_line_beside_which_a_streak_or_bare_floor_is_traced(tmp_path, seed, 
     """Held-out frames show where a second line was traced that is none."""
     settings = {"seed": seed, "frames": frames, "track": {"left": {"kind": "none"}}}
     drive = simulate_drive(SimulationSettings.model_validate(settings), tmp_path / "drive")
-    assert "one line only" in refusal(drive, tmp_path / "map")
+    assert "one line only" in refusal(drive, tmp_path / "map", remedy=BETWEEN)
 
 
 def border(met: float, spread_px: float, seed: int) -> np.ndarray:
@@ -262,7 +262,8 @@ def test_a_line_that_meets_edges_by_chance_where_a_lane_of_another_width_is(both
 
 def test_no_line_at_all(tmp_path):
     drive = simulated(tmp_path / "drive", 80, left="none", right="none")
-    assert re.search("no lane|no line|no pair of lines", refusal(drive, tmp_path / "map"))
+    message = refusal(drive, tmp_path / "map", remedy=BETWEEN)
+    assert re.search("no lane|no line|no pair of lines", message)
 
 
 @pytest.mark.parametrize("given_cm", [20.0, pytest.param(80.0, marks=pytest.mark.slow)])
