@@ -496,33 +496,36 @@ class _DenseSegment:
         """
         found: list[_Closure] = []
         tried: set[tuple[tuple[int, int, int], ...]] = set()
-        path_cm = path_lengths(opened.poses)
         least = self.revisit_settings.min_revisits
 
-        def is_known(revisits: list[Revisit]) -> bool:
-            return any(_go_around_alike(path_cm, revisits, one.revisits) for one in found)
-
-        for rivals, otherwise in self.sets_to_try(opened.poses, matched):
+        def try_first(rivals: Sequence[list[Revisit]]) -> None:
+            """Close the loops with the first set of a group that fits."""
             for group in rivals:
-                if otherwise and is_known(group):
-                    continue
                 grown = self.grown(opened.poses, group, matched)
                 # The same pairs with other whole turns between them are another way around.
                 key = tuple(sorted((r.earlier, r.later, r.turns) for r in grown))
-                if key in tried or len(grown) < least or (otherwise and is_known(grown)):
+                if key in tried or len(grown) < least:
                     continue
                 tried.add(key)
                 closure = self.try_closure(grown, opened)
                 if closure is not None:
                     found.append(closure)
                     break
+
+        for rivals in self.sets_to_try(opened.poses, matched):
+            try_first(rivals)
+        if self.find_camera:
+            for group in self.otherwise(opened.poses, matched, found):
+                try_first([group])
+        path_cm = path_lengths(opened.poses)
         chosen: list[_Closure] = []
         for one in sorted(found, key=lambda closure: self.cost(closure, opened)):
             if not any(_go_around_alike(path_cm, one.revisits, other.revisits) for other in chosen):
                 chosen.append(one)
         if self.find_camera:
             costs = self.costs(chosen, opened)
-            chosen = [chosen[k] for k in np.argsort(costs)[:_MOST_RIVALS]]
+            order = np.argsort(costs)[:_MOST_RIVALS]
+            chosen = [chosen[k] for k in order if costs[k] <= min(costs) + 2.0 * _NEAR]
         else:
             chosen = chosen[:1]
         return [self.confirmed_closure(one, opened, matched) for one in chosen]
@@ -566,28 +569,38 @@ class _DenseSegment:
 
     def sets_to_try(
         self, poses: Float[np.ndarray, "n 3"], matched: list[Revisit]
-    ) -> Iterator[tuple[list[list[Revisit]], bool]]:
-        """Sets of revisits that may be true together, and whether only another way around is of interest.
-
-        Of each group of sets, the first that fits is enough.
-        """
+    ) -> Iterator[list[list[Revisit]]]:
+        """Sets of revisits that may be true together; of each group, the first that fits is enough."""
         s = self.revisit_settings
         for explained, _ in consistent_revisits(poses, matched, s):
             supported = with_supported(poses, explained, matched, self.height, s)
             # Neighbours may support more than the drift explains. Where these do not fit, the explained may.
             groups = [supported, explained] if len(supported) > len(explained) else [supported]
-            yield [self.uncontradicted(poses, group) for group in groups], False
+            yield [self.uncontradicted(poses, group) for group in groups]
         alike = [r for r in matched if not r.faces]
         placing = [placing_revisits(poses, self.part, some, self.height) for some in (matched, alike)]
-        yield [one for one in placing if len(one) >= s.min_revisits], False
+        yield [one for one in placing if len(one) >= s.min_revisits]
         # A wrong camera bends the open loop: then true revisits explain each other better than it does.
         if len(matched) >= s.min_revisits:
-            yield [[replace(r, turns=whole_turns(poses, r)) for r in matched]], False
-        # Where all corners look alike, most pairs may be wrong; those as far apart share one mistake.
-        within = [r for r in matched if self.part[r.earlier] == self.part[r.later]]
-        for together in of_one_length(poses, within, s) if self.find_camera else []:
-            for explained, _ in consistent_revisits(poses, together, s):
-                yield [self.uncontradicted(poses, explained)], True
+            yield [[replace(r, turns=whole_turns(poses, r)) for r in matched]]
+
+    def otherwise(
+        self, poses: Float[np.ndarray, "n 3"], matched: list[Revisit], found: list[_Closure]
+    ) -> Iterator[list[Revisit]]:
+        """Sets of revisits that no closure explains, and that may close the loops another way around.
+
+        Where all corners look alike, most revisits are wrong; those between whose visits the path is as long
+        share one mistake.
+        """
+        known = {(r.earlier, r.later) for one in found for r in one.revisits}
+        left = [
+            r
+            for r in matched
+            if self.part[r.earlier] == self.part[r.later] and (r.earlier, r.later) not in known
+        ]
+        for together in of_one_length(poses, left, self.revisit_settings):
+            for explained, _ in consistent_revisits(poses, together, self.revisit_settings):
+                yield self.uncontradicted(poses, explained)
 
     def uncontradicted(self, poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> list[Revisit]:
         """Leave out revisits that those beside them contradict, unless too few would be left."""
@@ -595,27 +608,27 @@ class _DenseSegment:
         return left if len(left) >= self.revisit_settings.min_revisits else revisits
 
     def cost(self, closure: _Closure, opened: BundleResult) -> float:
-        """Cost of a closure beside others that go around alike: the one that explains most is best."""
-        within = sum(self.part[r.earlier] == self.part[r.later] for r in closure.revisits)
+        """Cost of a closure beside others that go around alike."""
         frames = len(self.part) * closure.bundle.misfit
-        return frames + closure.bundle.prior + self.beside_images(closure, opened) - _EXPLAINED * within
+        return frames + closure.bundle.prior + self.beside_images(closure, opened)
 
     def beside_images(self, closure: _Closure, opened: BundleResult) -> float:
-        """Negative log likelihood of what joins the parts, and of the heading that odometry misses in a lap.
+        """Negative log likelihood of a closure's revisits, and of the heading that odometry misses in a lap.
 
         A lap with five corners instead of four may look alike in all frames; the odometry knows better. It
         knows less where a gap was bridged, and where its camera was another one. And a car that was turned
-        round or lifted goes on near where it was. The number of revisits does not count: a lap that is too
-        short has more.
+        round or lifted goes on near where it was.
         """
         group, breaks = connected(self.part, closure.revisits), np.flatnonzero(np.diff(self.part))
         breaks = breaks[group[breaks] == group[breaks + 1]]
         moved = carried(closure.bundle.poses, breaks, self.height)
         joins = len(np.unique(self.part)) - len(np.unique(group))
+        within = sum(self.part[r.earlier] == self.part[r.later] for r in closure.revisits)
         other = float(np.log(closure.bundle.camera.K[0, 0] / opened.camera.K[0, 0]))
         drift_rad = float(np.hypot(_DRIFT_RAD, _DRIFT_OF_LENS_RAD * other))
         missed = self.missed(closure, opened, drift_rad)
-        return 0.5 * missed**2 + float(np.log(drift_rad / _DRIFT_RAD)) + moved - JOINED * joins
+        odometry = 0.5 * missed**2 + float(np.log(drift_rad / _DRIFT_RAD))
+        return odometry + moved - JOINED * joins - _EXPLAINED * within
 
     def missed(self, closure: _Closure, opened: BundleResult, drift_rad: float) -> float:
         """Heading that odometry misses in a lap of a closure, in sigmas, of which its drift is one part."""
