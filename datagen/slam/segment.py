@@ -72,7 +72,7 @@ _ADJUST = "adjust poses"
 _OPEN_LOOP = ("pitch", "roll", "yaw", "lever")
 #: Median residuals of revisits after closure along and across the road, in camera heights, and misfit of
 #: neighbouring frames relative to before, at most. True closures leave 0.08 and 0.03 heights on the real
-#: drives, and a misfit of 1.08 times at most on these and on rings of tiles; places that only look alike, as
+#: drives, and a misfit of 1.11 times at most on these and on rings of tiles; places that only look alike, as
 #: on an open road, leave more.
 MAX_MISSED, MAX_MISFIT = (0.6, 0.3), 1.15
 #: The camera is adjusted until its focal length moves by less than this share, or so often. Chosen: a tenth
@@ -107,13 +107,13 @@ _BESIDE_HEIGHTS, _TELLS = (4.0, 8.0, 12.0), 0.75
 #: Heading by which places beside each other on a straight may differ, [rad]. Chosen: below that of a circle
 #: of 40 camera heights, 12 of them further on.
 _STRAIGHT_RAD = 0.3
-#: Difference of the costs of another way around and of the best one, up to which the lens may be either's.
-#: Measured on rings of tiles, with the camera of the start right: 25 and more beside the true one; where the
-#: false one won, 0 to 10.
+#: Difference of the costs of another way around and of the best one, up to which the lens may be either's; up
+#: to twice as much, its camera is adjusted. Measured on rings of tiles, without the number of revisits and
+#: with the camera of the start right: 25 and more beside the true one; where the false one won, 0 to 10.
 _NEAR = 20.0
 #: Closures by different ways around whose camera is adjusted. Chosen: the true one was the first or second
 #: of four rings of tiles.
-_MOST_RIVALS = 3
+_MOST_WAYS = 3
 #: Laps that differ in length by more than this logarithm, or in their whole turns, lead along other ways.
 #: Chosen: less than a tile of a ring of ten.
 _OTHER_LAP = 0.1
@@ -179,7 +179,7 @@ class SolvedSegment:
     @property
     def revisits_within_parts(self) -> list[Revisit]:
         """Revisits between whose visits the drive was recorded without a long gap."""
-        return [r for r in self.revisits if self.part[r.earlier] == self.part[r.later]]
+        return _within_parts(self.part, self.revisits)
 
     def only(self, chosen: Int[np.ndarray, "m"]) -> SolvedSegment:
         """Return some of its frames, which no revisit joins to the others.
@@ -203,6 +203,11 @@ class SolvedSegment:
             part=self.part[chosen],
             keys=None if self.keys is None else place[self.keys][place[self.keys] >= 0],
         )
+
+
+def _within_parts(part: Int[np.ndarray, "n"], revisits: Sequence[Revisit]) -> list[Revisit]:
+    """Those between whose visits no long gap lies."""
+    return [r for r in revisits if part[r.earlier] == part[r.later]]
 
 
 def heading_drift(poses: Float[np.ndarray, "n 3"], revisits: list[Revisit]) -> float:
@@ -519,12 +524,12 @@ class _DenseSegment:
                 try_first([group])
         path_cm = path_lengths(opened.poses)
         chosen: list[_Closure] = []
-        for one in sorted(found, key=lambda closure: self.cost(closure, opened)):
+        for one in sorted(found, key=lambda closure: self.cost(closure, closure.bundle.misfit, opened)):
             if not any(_go_around_alike(path_cm, one.revisits, other.revisits) for other in chosen):
                 chosen.append(one)
         if self.find_camera:
             costs = self.costs(chosen, opened)
-            order = np.argsort(costs)[:_MOST_RIVALS]
+            order = np.argsort(costs)[:_MOST_WAYS]
             chosen = [chosen[k] for k in order if costs[k] <= min(costs) + 2.0 * _NEAR]
         else:
             chosen = chosen[:1]
@@ -593,11 +598,7 @@ class _DenseSegment:
         share one mistake.
         """
         known = {(r.earlier, r.later) for one in found for r in one.revisits}
-        left = [
-            r
-            for r in matched
-            if self.part[r.earlier] == self.part[r.later] and (r.earlier, r.later) not in known
-        ]
+        left = [r for r in _within_parts(self.part, matched) if (r.earlier, r.later) not in known]
         for together in of_one_length(poses, left, self.revisit_settings):
             for explained, _ in consistent_revisits(poses, together, self.revisit_settings):
                 yield self.uncontradicted(poses, explained)
@@ -607,10 +608,9 @@ class _DenseSegment:
         left = without_contradicted(poses, revisits, self.height)
         return left if len(left) >= self.revisit_settings.min_revisits else revisits
 
-    def cost(self, closure: _Closure, opened: BundleResult) -> float:
-        """Cost of a closure beside others that go around alike."""
-        frames = len(self.part) * closure.bundle.misfit
-        return frames + closure.bundle.prior + self.beside_images(closure, opened)
+    def cost(self, closure: _Closure, misfit: float, opened: BundleResult) -> float:
+        """Negative log likelihood of a closure with some misfit per point in view."""
+        return len(self.part) * misfit + closure.bundle.prior + self.beside_images(closure, opened)
 
     def beside_images(self, closure: _Closure, opened: BundleResult) -> float:
         """Negative log likelihood of a closure's revisits, and of the heading that odometry misses in a lap.
@@ -623,7 +623,7 @@ class _DenseSegment:
         breaks = breaks[group[breaks] == group[breaks + 1]]
         moved = carried(closure.bundle.poses, breaks, self.height)
         joins = len(np.unique(self.part)) - len(np.unique(group))
-        within = sum(self.part[r.earlier] == self.part[r.later] for r in closure.revisits)
+        within = len(_within_parts(self.part, closure.revisits))
         other = float(np.log(closure.bundle.camera.K[0, 0] / opened.camera.K[0, 0]))
         drift_rad = float(np.hypot(_DRIFT_RAD, _DRIFT_OF_LENS_RAD * other))
         missed = self.missed(closure, opened, drift_rad)
@@ -632,7 +632,7 @@ class _DenseSegment:
 
     def missed(self, closure: _Closure, opened: BundleResult, drift_rad: float) -> float:
         """Heading that odometry misses in a lap of a closure, in sigmas, of which its drift is one part."""
-        within = [r for r in closure.revisits if self.part[r.earlier] == self.part[r.later]]
+        within = _within_parts(self.part, closure.revisits)
         if not within:
             return 0.0
         periods = self.view.commands.periods
@@ -651,10 +651,7 @@ class _DenseSegment:
         if not rivals:
             return []
         agree = shared_misfits([one.bundle for one in rivals])
-        return [
-            len(self.part) * misfit + one.bundle.prior + self.beside_images(one, opened)
-            for one, misfit in zip(rivals, agree, strict=True)
-        ]
+        return [self.cost(one, misfit, opened) for one, misfit in zip(rivals, agree, strict=True)]
 
     def likeliest_first(self, rivals: Sequence[_Closure], opened: BundleResult) -> list[_Closure]:
         """Order closures that go around by other ways by their likelihood, and note what the first tells."""
