@@ -170,7 +170,7 @@ def measure_lane(
         fit: How cubics are fitted to them.
 
     Raises:
-        TrackingLostError: If no two lines run along the drive.
+        NoLaneError: If no two lines run along the drive.
     """
     height = solved.camera.mounting.height_cm
     path, edges = edges_of_segment(solved, solved.scans)

@@ -7,7 +7,7 @@ import pytest
 
 from datagen.lanes.path import PathEdges, path_of_poses
 from datagen.lanes.trace import TracedLane, TraceSettings, _fits_better, trace_known_lane
-from lanenet.errors import CalibrationError, TrackingLostError
+from lanenet.errors import CalibrationError, NoLaneError
 
 
 def traced(lane_cm: float, centre_cm: float, left: float, right: float) -> TracedLane:
@@ -48,7 +48,7 @@ def test_which_lane_is_driven(free, lane, better):
     ],
 )
 def test_another_width_is_named_where_two_lines_are_seen(monkeypatch, free, lane, message):
-    with pytest.raises((CalibrationError, TrackingLostError), match=message):
+    with pytest.raises((CalibrationError, NoLaneError), match=message):
         chosen(monkeypatch, free, lane)
 
 
@@ -79,7 +79,7 @@ def chosen(monkeypatch, free: TracedLane, lane: TracedLane | None) -> tuple[Trac
     def trace(path, edges, height_cm, lane_width_cm, settings):
         found = free if lane_width_cm is None else lane
         if found is None:
-            raise TrackingLostError("no lane")
+            raise NoLaneError("no lane")
         return found
 
     monkeypatch.setattr("datagen.lanes.trace.trace_lane", trace)
