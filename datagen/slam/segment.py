@@ -380,7 +380,8 @@ def _go_around_alike(path_cm: Float[np.ndarray, "n"], one: list[Revisit], other:
         laps.append((float(np.median(between_cm[once])), float(np.median(turns[once]))))
     (short_cm, short_turns), (long_cm, long_turns) = sorted(laps)
     times = max(round(long_cm / short_cm), 1)
-    return abs(np.log(long_cm / (times * short_cm))) < _OTHER_LAP and long_turns == times * short_turns
+    as_long = bool(abs(np.log(long_cm / (times * short_cm))) < _OTHER_LAP)
+    return as_long and long_turns == times * short_turns
 
 
 def shared_misfits(bundles: Sequence[BundleResult]) -> list[float]:
