@@ -122,9 +122,20 @@ def find_lane(
     near = edges_on_map(scans, segment.poses, camera.wheelbase_cm, _KINK_HEIGHTS * height, lead_cm)
     near = near.towards_dark() if dark else near
     lines = [with_kinks(line, near, height, lane.lane_cm) if line.rank == 0 else line for line in lines]
-    lines = [replace(line, marking_at_cm=marking_widths(line, near, height)) for line in lines]
+    lines = [replace(line, marking_at_cm=marking_widths(line, near, height)) for line in _in_order(lines)]
     free_cm = None if several else free_cm
     return MappedSegment(segment, path.s_frames_cm, _laps(segment, path), lane, lines, dark, free_cm, several)
+
+
+def _in_order(lines: list[LaneLine]) -> list[LaneLine]:
+    """Leave out lines of the next lanes that do not lie beyond those before them, and all beyond these."""
+    found = {line.index: line for line in lines}
+    first, last = 0, 1
+    while first - 1 in found and found[first - 1].lies_left_of(found[first]):
+        first -= 1
+    while last + 1 in found and found[last].lies_left_of(found[last + 1]):
+        last += 1
+    return [found[index] for index in range(first, last + 1)]
 
 
 def _laps(segment: SolvedSegment, path: Path) -> Int[np.ndarray, "n"]:
@@ -141,8 +152,11 @@ def check_lane(segment: MappedSegment, drive: Drive) -> None:
     """Refuse a segment in which one of the lines is hardly seen.
 
     Raises:
-        NoLaneError: Names the share of the path along which each line was seen.
+        NoLaneError: Names the share of the path along which each line was seen, or says that they cross.
     """
+    left, right = (next(x for x in segment.lines if x.rank == 0 and x.side == side) for side in SIDES)
+    if not left.lies_left_of(right):
+        raise NoLaneError(f"{drive.path}: the lines of the driven lane cross, expected one beside the other")
     share: dict[str, float] = {
         line.side: float(line.supported(segment.s_frames_cm).mean())
         for line in segment.lines

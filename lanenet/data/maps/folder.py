@@ -62,8 +62,6 @@ _LEAST_MAP_CM = 1.0
 _MAX_RANK = 20
 #: Largest size of a match, which is about a share. Chosen: no frame comes near it.
 _MOST_MATCH = 100.0
-#: Positions at which the order of two lines is checked; chosen.
-_SIDES_CHECKED = 64
 
 
 class MapMeta(Settings):
@@ -441,14 +439,7 @@ def _read_lines(path: Path, segments: set[int]) -> dict[int, list[LaneLine]]:
 def _check_sides(path: Path, segment: int, lines: list[LaneLine]) -> None:
     """Refuse lines that do not lie beside each other in their order, seen in the path's direction."""
     for left, right in itertools.pairwise(lines):
-        low, high = max(left.knots_cm[3], right.knots_cm[3]), min(left.knots_cm[-4], right.knots_cm[-4])
-        s_cm = np.linspace(low, high, _SIDES_CHECKED)
-        across = left.everywhere(s_cm) - right.everywhere(s_cm)
-        along = left.everywhere(s_cm, 1) + right.everywhere(s_cm, 1)
-        to_left = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
-        known = left.supported(s_cm) & right.supported(s_cm)
-        # Where one of the lines was not seen, its course is a guess.
-        if known.any() and not np.median(to_left[known]) > 0.0:
+        if not left.lies_left_of(right):
             raise MapFormatError(
                 f"{path}: segment {segment}: line {left.index} does not lie to the left of line {right.index}"
             )

@@ -15,6 +15,8 @@ Side = Literal["left", "right"]
 #: Unpainted share above which a line is dashed. Measured on ten simulated and three real drives: 0.18 to 0.47
 #: for dashed lines, at most 0.09 for solid ones, worn or not.
 _DASHED_SHARE = 0.12
+#: Positions at which the order of two lines is checked; chosen.
+_SIDES_CHECKED = 64
 
 
 def _none() -> Float[np.ndarray, "0"]:
@@ -111,6 +113,20 @@ class LaneLine:
     def _spline(self) -> BSpline:
         """To be evaluated: making it takes longer than evaluating it for a frame."""
         return BSpline(self.knots_cm, self.coefficients_cm, 3)
+
+    def lies_left_of(self, other: LaneLine) -> bool:
+        """Return whether most of the line lies to the left of another one, seen in the path's direction.
+
+        Where one of the two was not seen, its course is a guess and does not count; nor does all of it where
+        they were never seen beside each other.
+        """
+        (low, high), (least, most) = self.span_cm, other.span_cm
+        s_cm = np.linspace(max(low, least), min(high, most), _SIDES_CHECKED)
+        across = self.everywhere(s_cm) - other.everywhere(s_cm)
+        along = self.everywhere(s_cm, 1) + other.everywhere(s_cm, 1)
+        to_left = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+        known = self.supported(s_cm) & other.supported(s_cm)
+        return not known.any() or bool(np.median(to_left[known]) > 0.0)
 
     def supported(self, s_cm: Float[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
         """Return which positions are supported."""

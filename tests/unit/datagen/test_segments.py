@@ -10,7 +10,7 @@ from made_up_drive import made_up_drive
 
 from datagen import prepare
 from datagen import segments as drive_segments
-from datagen.lanes.find import MappedSegment, check_lane
+from datagen.lanes.find import MappedSegment, _in_order, check_lane
 from datagen.lanes.trace import TracedLane
 from datagen.segments import LanesOfDrive, SolvedDrive, sigma_of_earlier
 from datagen.settings import MapSettings
@@ -25,7 +25,7 @@ from datagen.slam.settings import GuessSettings
 from lanenet.data.drives.recording import Drive
 from lanenet.data.files import write_json, write_text
 from lanenet.data.maps.line import LaneLine, Side
-from lanenet.errors import CalibrationError, MapFormatError, TrackingLostError
+from lanenet.errors import CalibrationError, MapFormatError, NoLaneError, TrackingLostError
 from lanenet.perception.edges.road import RoadEdges
 
 CAMERA = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
@@ -138,7 +138,9 @@ def test_a_drive_that_was_solved_for_its_camera_is_not_solved_again(monkeypatch)
 
 def _line(side: Side, until_cm: float) -> LaneLine:
     knots = np.concatenate([np.zeros(3), np.linspace(0.0, 3000.0, 6), np.full(3, 3000.0)])
-    return LaneLine(side, knots, np.zeros((8, 2)), np.array([[0.0, until_cm]]), 0.1)
+    along = np.array([knots[k + 1 : k + 4].mean() for k in range(8)])
+    beside = np.full(8, 20.0 if side == "left" else -20.0)
+    return LaneLine(side, knots, np.column_stack([along, beside]), np.array([[0.0, until_cm]]), 0.1)
 
 
 def _map(
@@ -229,6 +231,23 @@ def test_marks_on_the_floor_that_were_joined_are_no_line(monkeypatch):
             replace(one, lane=replace(one.lane, left_cm=seldom, right_cm=seldom, centre_cm=np.zeros(100))),
             drive,
         )
+
+
+def test_lines_that_cross_bound_no_lane(monkeypatch):
+    drive = made_up_drive(200)
+    (whole,) = _map(monkeypatch, drive).segments
+    left, right = whole.lines
+    assert left.lies_left_of(right) and not right.lies_left_of(left)
+    swapped = [replace(right, side="left"), replace(left, side="right")]
+    with pytest.raises(NoLaneError):
+        check_lane(replace(whole, lines=swapped), drive)
+
+
+def test_a_line_of_the_next_lane_on_the_wrong_side_is_left_out_with_those_beyond_it(monkeypatch):
+    left, right = _map(monkeypatch, made_up_drive(200)).segments[0].lines
+    next_one, beyond = replace(left, side="right", rank=1), replace(right, side="right", rank=2)
+    assert _in_order([left, right, next_one, beyond]) == [left, right]
+    assert _in_order([replace(left, rank=1), left, right]) == [left, right]
 
 
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):
