@@ -222,7 +222,7 @@ def _with_focal(
     bundle = solver.settings.bundle.model_copy(update={"focal": focal_sigma})
     solver = replace(solver, settings=solver.settings.model_copy(update={"bundle": bundle}))
     solved = solver.solve(drive, camera, find_camera=True, prior_camera=camera)
-    sigma = honest_sigma(solved.bundle.sigma, solved.ties_camera, found.strain, bundle, camera.width)
+    sigma = honest_sigma(solved, found.strain, bundle, camera.width)
     return replace(found, solved=solved, sigma=sigma)
 
 

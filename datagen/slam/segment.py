@@ -166,6 +166,11 @@ class SolvedSegment:
         return bool(self.revisits) and self.decided
 
     @property
+    def focal_by_drift(self) -> float:
+        """Logarithm of the focal length that would explain the heading that odometry misses in a lap."""
+        return self.missed * _DRIFT_RAD / _DRIFT_OF_LENS_RAD
+
+    @property
     def path_cm(self) -> Float[np.ndarray, "n"]:
         """Length of the path up to each frame; what lies between two parts does not count."""
         steps = np.diff(path_lengths(self.poses), prepend=0.0)

@@ -208,7 +208,7 @@ def find_camera(drive: Drive, start: Camera | None, solver: SegmentSolver) -> Fo
             if again.ties_camera:
                 solved = min(solved, again, key=strain_of)
     strain = prior_strain(solved.camera, camera, settings.bundle)
-    sigma = honest_sigma(solved.bundle.sigma, solved.ties_camera, strain, settings.bundle, camera.width)
+    sigma = honest_sigma(solved, strain, settings.bundle, camera.width)
     return FoundCamera(solved, candidates, sigma, start is not None, strain_of(solved))
 
 
@@ -267,13 +267,13 @@ def prior_strain(camera: Camera, prior: Camera, priors: BundleSettings) -> float
 
 
 def honest_sigma(
-    sigma: dict[str, float], closed: bool, strain: float, priors: BundleSettings, width: int
+    solved: SolvedSegment, strain: float, priors: BundleSettings, width: int
 ) -> dict[str, float]:
     """Widen the standard deviations of an adjustment to realistic ones.
 
     Args:
-        sigma: As the adjustment gives them.
-        closed: Whether a loop was closed; if not, the lens was held, and is known as well as its prior.
+        solved: The drive with its camera. If no loop was closed that ties the lens, the lens was held, and is
+            known as well as its prior; if one was, heading that odometry misses in a lap may be the lens's.
         strain: See :func:`prior_strain`; what bends the principal point bends the other numbers too.
         priors: Of the adjustment.
         width: Image width, [px].
@@ -284,10 +284,9 @@ def honest_sigma(
     """
     centre = priors.centre_px * width / _REFERENCE_WIDTH
     prior = {"focal": priors.focal, "cx": centre, "cy": centre, "k1": priors.k1}
-    return {
-        name: prior[name] if name in _LENS and not closed else max(1.0, strain) * sigma[name]
-        for name in CAMERA_NAMES
-    }
+    sigma, held = solved.bundle.sigma, () if solved.ties_camera else _LENS
+    wide = {name: prior[name] if name in held else max(1.0, strain) * sigma[name] for name in CAMERA_NAMES}
+    return wide if held else wide | {"focal": float(np.hypot(wide["focal"], solved.focal_by_drift))}
 
 
 def turning_rad(poses: Float[np.ndarray, "n 3"]) -> float:

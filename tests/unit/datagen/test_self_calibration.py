@@ -187,16 +187,25 @@ def test_pictures_that_bend_the_camera_are_refused():
 
 
 def test_strain_widens_uncertainties_and_an_open_loop_knows_no_more_of_the_lens_than_the_prior():
-    priors = BundleSettings()
-    closed = honest_sigma(SIGMA, True, 0.4, priors, 320)
+    priors, solved = BundleSettings(), found(np.linspace(0.0, 4.0 * np.pi, 400)).solved
+    closed = honest_sigma(solved, 0.4, priors, 320)
     assert closed == SIGMA
-    strained = honest_sigma(SIGMA, True, 3.0, priors, 320)
+    strained = honest_sigma(solved, 3.0, priors, 320)
     assert strained["focal"] == pytest.approx(3.0 * closed["focal"])
     held = dict.fromkeys(CAMERA_NAMES, 1e-9) | {"pitch": 0.002}
-    opened = honest_sigma(held, False, 0.0, priors, 320)
+    unsure = replace(solved, bundle=replace(solved.bundle, sigma=held), decided=False)
+    opened = honest_sigma(unsure, 0.0, priors, 320)
     assert opened["focal"] == priors.focal and opened["k1"] == priors.k1
     assert opened["cx"] == opened["cy"] == 2.0 * priors.centre_px
     assert opened["pitch"] == pytest.approx(0.002)
+
+
+def test_heading_that_odometry_misses_in_a_lap_may_be_the_lens():
+    # 0.3 rad in a lap are what a focal length gives that is 2 % off.
+    solved = replace(found(np.linspace(0.0, 4.0 * np.pi, 400)).solved, missed=1.5)
+    sigma = honest_sigma(solved, 0.4, BundleSettings(), 320)
+    assert sigma["focal"] == pytest.approx(math.hypot(SIGMA["focal"], 0.03))
+    assert sigma | {"focal": 0.0} == SIGMA | {"focal": 0.0}
 
 
 @pytest.mark.parametrize("name", CAMERA_NAMES)
@@ -402,7 +411,7 @@ def test_with_the_height_the_focal_length_of_an_open_road_comes_out_better(tmp_p
     start = nudged(drive.camera, "focal", math.log(1.2))
     solver = SegmentSolver(MapSettings(find_bumper=False), np.random.default_rng(0))
     solved = solver.solve(drive, start, find_camera=True)
-    sigma = honest_sigma(solved.bundle.sigma, False, 0.0, BundleSettings(), 160)
+    sigma = honest_sigma(solved, 0.0, BundleSettings(), 160)
     alone = FoundCamera(solved, [], sigma, False, 0.0)
     given, _ = fit_height(alone, drive, drive.lane_width_cm / 22.0, solver.settings, solver)
     true_px = drive.camera.K[0, 0]
