@@ -104,9 +104,10 @@ chain: $(VENV)/.stamp-dev
 # Roads take most of an hour on one core; KIND is another one of trap_drives.py: tiles, office, mats, floors, shifted.
 # TRAPS adds arguments, such as --drives 0:20 --processes 2.
 KIND ?= roads
+FOLDER ?= runs/traps/$(KIND)
 traps: $(VENV)/.stamp-dev
-	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --kind $(KIND) --folder runs/traps/$(KIND) $(TRAPS)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder runs/traps/$(KIND)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_traps.py --kind $(KIND) --folder $(FOLDER) $(TRAPS)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_broken_maps.py --folder $(FOLDER)
 
 # 500 drives take 20 minutes on one core; goes on where it stopped. ABLATION adds arguments, such as --processes 2.
 ablation: $(VENV)/.stamp-dev

@@ -18,7 +18,7 @@ from lanenet.data.drives import Commands, Drive, open_drive
 from lanenet.data.drives.content import image_marks
 from lanenet.data.drives.recording import COMMAND_NAMES, MAX_PAUSE_S, ImageSource
 from lanenet.data.segments import true_runs
-from lanenet.errors import CalibrationError, DriveFormatError, TrackingLostError, counted
+from lanenet.errors import CalibrationError, DriveFormatError, NoLaneError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
 from lanenet.perception.edges.canny import EdgeSettings, find_edges
 from lanenet.perception.edges.static import find_static, lens_circle_px, spread_frames
@@ -359,11 +359,11 @@ def check_edges(drive: Drive, settings: EdgeSettings) -> None:
     """Refuse a drive with hardly any edges on the road, before the camera is searched for.
 
     Raises:
-        TrackingLostError: Names the number of edge points.
+        NoLaneError: Names the number of edge points.
     """
     count = _usual_edges(drive, settings)
     if count < _LEAST_EDGES:
-        raise TrackingLostError(
+        raise NoLaneError(
             f"{drive.path}: {count:.0f} edge points in the lower two thirds of a frame, expected "
             f"{_LEAST_EDGES} at least: no line is visible"
         )

@@ -54,7 +54,8 @@ def rescaled(folder: Path, prepared: PreparedDrive) -> Solved | None:
         prepared: The drive, with the new lane width.
 
     Returns:
-        None if a file of the map cannot be read, or it is not of these frames.
+        None if a file of the map cannot be read, it is not of these frames, or half of its lane may be one,
+        which the earlier width made too small for a camera or for tape.
     """
     try:
         earlier, report = _read(folder, prepared)
@@ -63,7 +64,11 @@ def rescaled(folder: Path, prepared: PreparedDrive) -> Solved | None:
     if earlier is None:
         return None
     width_cm = earlier.drive_map.meta.lane_width_cm
-    factor = prepared.request.lane_width_cm / width_cm
+    factor, sizes = prepared.request.lane_width_cm / width_cm, prepared.settings.verdict
+    height_cm, tape_cm = earlier.drive_map.camera.mounting.height_cm, earlier.drive_map.meta.tape_cm
+    # As find_lane_width has it: of half the lane, camera and tape would be twice as large.
+    if factor < 1.0 and (2.0 * height_cm > sizes.height_cm[1] or 2.0 * tape_cm > sizes.tape_cm[1]):
+        return None
     figures = {name: report[name] for name in _KEPT_FIGURES if name in report}
     sigma = figures.get("calibration", {}).get("sigma", {})
     said = (

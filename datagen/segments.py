@@ -23,6 +23,7 @@ from datagen.slam.camera.self_calibration import MAX_STRAIN, FoundCamera, find_c
 from datagen.slam.loops.parts import LEAST_TIED, connected
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.view import LEAST_POINTS
+from lanenet.data.camera_file import MAP_CAMERA_NAME, read_sigma
 from lanenet.data.drives import Drive
 from lanenet.data.segments import equal_runs
 from lanenet.errors import CalibrationError, MapFormatError, TrackingLostError, counted
@@ -111,7 +112,8 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
         TrackingLostError: If the drive shows too few edges of the road.
     """
     if prepared.camera is not None and not prepared.request.refine_camera:
-        sigma = sigma_of_earlier(prepared.request.camera_path)
+        own = prepared.drive.path / MAP_CAMERA_NAME
+        sigma = sigma_of_earlier(prepared.request.camera_path or (own if own.is_file() else None))
         return CameraOfDrive(prepared.camera, figures={"camera_sigma": sigma} if sigma else {}, sigma=sigma)
     drive = prepared.drive
     check_edges(drive, prepared.settings.perception.edges)
@@ -140,20 +142,24 @@ def camera_of_drive(prepared: PreparedDrive, solver: SegmentSolver) -> CameraOfD
 
 
 def sigma_of_earlier(camera_path: Path | None) -> dict[str, float]:
-    """Return the sigmas of a camera that was found while an earlier drive was mapped; none for other cameras.
+    """Return the sigmas of a camera that was found from earlier drives; none for other cameras.
 
     Args:
-        camera_path: The map's folder, or the camera file in it.
+        camera_path: The camera file, or the folder of a map, whose report has them if its camera file has
+            none, as in earlier versions.
 
     Raises:
         MapFormatError: If the map's report cannot be read.
+        CalibrationError: If the camera file cannot be read.
     """
-    folder = camera_path if camera_path is None or camera_path.is_dir() else camera_path.parent
-    if folder is None or not (folder / "map.yaml").is_file():
+    if camera_path is None:
         return {}
-    file = folder / "report.json"
-    report = read_json(file, MapFormatError)
-    with parsing(f"{file}: sigmas of the camera", MapFormatError):
+    path = camera_path / MAP_CAMERA_NAME if camera_path.is_dir() else camera_path
+    report_path = path.with_name("report.json")
+    if (found := read_sigma(path)) or not path.with_name("map.yaml").is_file():
+        return found
+    report = read_json(report_path, MapFormatError)
+    with parsing(f"{report_path}: sigmas of the camera", MapFormatError):
         found = report.get("calibration", {}).get("sigma") or report.get("camera_sigma", {})
         return {str(name): float(value) for name, value in found.items()}
 

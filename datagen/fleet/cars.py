@@ -21,7 +21,7 @@ from datagen.fleet.work import REFUSED, REJECTED, Outcome, attempted, mark, vers
 from datagen.made import key_of
 from datagen.tracks.cameras import DriveCamera, camera_sigma
 from datagen.tracks.car import agreeing_drives, camera_of_car, may_be_one, unlike
-from lanenet.data.camera_file import read_camera, write_camera
+from lanenet.data.camera_file import read_camera, sigma_residuals, write_camera
 from lanenet.errors import MapFormatError, TrackingLostError
 from lanenet.reading import read_json
 
@@ -80,7 +80,9 @@ def _find_camera(job: SeveralJob) -> Outcome:
         except TrackingLostError as error:
             mark(folder, {**marker, "verdict": REFUSED, "reason": str(error)}, meter)
             return Outcome(REFUSED, str(error))
-        write_camera(folder / CAMERA_NAME, found.camera, f"from {', '.join(by_name)} together")
+        how = f"from {', '.join(by_name)} together"
+        sigma = sigma_residuals(found.camera, found.sigma)
+        write_camera(folder / CAMERA_NAME, found.camera, how, sigma)
         facts = {"sigma": found.sigma, "heights_cm": [None if h != h else h for h in found.height_cm]}
         mark(folder, {**marker, "verdict": "found", "reason": "", **facts}, meter)
     return Outcome("found")

@@ -121,10 +121,7 @@ def trace_lane(
         for found in (markings.follow(centre + share * lane, band) for share in (0.5, -0.5))
     )
     if np.isfinite(left[:driven]).mean() + np.isfinite(right[:driven]).mean() < 0.3:
-        raise NoLaneError(
-            f"no pair of lines about {lane_width_cm:.0f} cm apart runs along the drive: check the lane width "
-            "and the camera's height"
-        )
+        raise NoLaneError("no pair of lines at one distance runs along the drive")
     return TracedLane(left, right, centre, lane, tape)
 
 
@@ -150,8 +147,6 @@ def trace_known_lane(
     try:
         lane = trace_lane(path, edges, height_cm, lane_width_cm, settings)
     except NoLaneError:
-        if free is None:
-            raise
         lane = None
     if (
         free is not None

@@ -17,7 +17,7 @@ from datagen.slam.commands import BREAK_PERIODS, commands_of, fit_steering
 from datagen.slam.loops.pose_graph import revisit_residuals
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
-from lanenet.data.maps.mapped_drive import MappedDrive
+from lanenet.data.maps.mapped_drive import NOT_MAPPED, MappedDrive
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 
@@ -111,20 +111,28 @@ def map_evidence(
     # A given camera that the drive has refined counts as known: its lens was not searched for.
     known = not calibration.get("candidates")
     found_cm = meta.mapped_lane_cm if free_cm is None else free_cm
+    largest = int(np.argmax(frames))
+    # As many times round as a circle is longer than the diagonal of the square around it.
+    extent_cm = float(np.hypot(*np.ptp(drive_map.poses[drive_map.segment == largest, :2], axis=0)))
+    rounds = segments[largest]["path_cm"] / max(extent_cm * np.pi / 2.0**0.5, 1.0)
+    why_open = (
+        ("none of its parts has most of the frames", 2 * frames[largest] <= frames.sum()),
+        ("places do not tell how long a lap is", calibration.get("alike", False)),
+        ("nothing certainly closes the lap", not segments[largest]["closed"]),
+    )
     return MapEvidence(
         labels=quality.labels,
         coverage=coverage(np.concatenate(quality.held_out[:2])),
         wrong=tuple(one.text(drive_map) for one in quality.wrong),
         wrong_share=quality.wrong_share,
         revisits=revisits,
-        laps=max(meta.laps, int(np.ptp(drive_map.poses[:, 2]) / (2.0 * np.pi))),
-        comes_round=segments[int(np.argmax(frames))]["closed"]
-        and 2 * frames.max() > frames.sum()
-        and not calibration.get("alike", False),
+        laps=max(meta.laps, int(np.ptp(drive_map.poses[:, 2]) / (2.0 * np.pi)), int(rounds)),
+        open_for=next((why for why, is_so in why_open if is_so), ""),
         closure_across_heights=across_cm / revisits / height_cm if revisits else None,
-        sigma={} if known else calibration["sigma"],
+        sigma=figures.get("camera_sigma", {}) if known else calibration["sigma"],
+        missed=0.0 if known else calibration.get("missed", 0.0),
         # Reports of earlier versions do not know.
-        alike=not known and bool(revisits) and not calibration.get("closed", True),
+        turn_open=not known and bool(revisits) and not calibration.get("closed", True),
         strain=0.0 if known else calibration.get("strain", 0.0),
         given_lane_cm=meta.lane_width_cm,
         bend_lane_cm=figures["lane_width"]["bend_cm"],
@@ -139,7 +147,7 @@ def map_evidence(
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
-        elsewhere=int(frames.sum() - frames.max()),
+        elsewhere=int(frames.sum() - frames.max()) + quality.status.count(NOT_MAPPED),
         pauses=figures.get("pauses", 0),
     )
 
@@ -169,7 +177,7 @@ def map_notes(drive_map: DriveMap, segments: list[dict[str, Any]], frames: int, 
     metres = 0.01 * sum(segment["path_cm"] for segment in segments)
     return [
         f"{len(drive_map.frames)} of {frames} frames mapped, {metres:.1f} m of road, {revisits} revisits"
-        + ("" if revisits else ": no place was seen twice, so no loop was closed"),
+        + ("" if revisits else ": no loop was certainly closed"),
         f"{'distance of the mapped lines' if free else 'lane'} {meta.mapped_lane_cm:.1f} cm, {meta.markings} "
         f"marking {meta.tape_cm:.1f} cm, scale from the {meta.scale_from}",
     ]

@@ -14,14 +14,21 @@ from datagen.quality.residuals import Residuals, coverage, robust_sd
 from datagen.quality.verdict import LabelEvidence
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.label_errors import LabelErrors
-from lanenet.data.maps.mapped_drive import DELETED, NOT_TO_LABEL, OUTSIDE, MappedDrive, label_frames
+from lanenet.data.maps.mapped_drive import (
+    DELETED,
+    NOT_MAPPED,
+    NOT_TO_LABEL,
+    OUTSIDE,
+    MappedDrive,
+    label_frames,
+)
 from lanenet.data.segments import true_runs
 from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.lane import ROWS_CM, SIDES
 from lanenet.geometry.poses import path_lengths
 
 #: Status of a frame, beside the reasons of :mod:`lanenet.data.maps.mapped_drive`; reports use these as keys.
-NOT_MAPPED, LABELLED = "segment not mapped", "labelled"
+LABELLED = "labelled"
 #: Random stream for held-out frames, so that other draws do not depend on them.
 _STREAM = 1
 #: Length over which labels are taken together and below which a section is not named, in places. Chosen: half
@@ -49,10 +56,14 @@ class WrongSection:
     frames: tuple[int, ...]
 
     @property
+    def beside(self) -> bool:
+        """Whether the line is none of the driven lane's."""
+        return self.index not in (0, 1)
+
+    @property
     def name(self) -> str:
         """Name of the line: that of its side, seen in the path's direction."""
-        beyond = "" if self.index in (0, 1) else " of the adjacent lane"
-        return f"{SIDES[self.index > 0]} line{beyond}"
+        return f"{SIDES[self.index > 0]} line{' of the adjacent lane' if self.beside else ''}"
 
     @property
     def length_cm(self) -> float:
@@ -133,7 +144,7 @@ def label_evidence(
         metres=float(step_m.sum()),
         left_m=float(step_m[bend > 1.0].sum()),
         right_m=float(step_m[bend < -1.0].sum()),
-        not_labelled={why: n for why, n in counts.most_common() if why not in (LABELLED, *NOT_TO_LABEL)},
+        not_labelled={why: n for why, n in counts.most_common() if why not in (LABELLED, DELETED)},
         doubted=doubted,
         in_view=in_view,
         outside_share=counts[OUTSIDE] / max(frames + counts[OUTSIDE], 1),
@@ -146,8 +157,8 @@ def wrong_sections(
     """Find the sections along which most labels of a line are more likely off by 3 cm than not.
 
     Returns:
-        The sections, the longest first, and their share of the length along which the driven lane's lines
-        have labels.
+        The sections, those of the driven lane first, the longest first; and their share of the length along
+        which the driven lane's lines have labels.
     """
     found: list[WrongSection] = []
     seen = wrong = 0
@@ -174,7 +185,7 @@ def wrong_sections(
                     shown = np.unique(frame[off & np.isin(place, run)])
                     section = (start, start + len(run) * place_cm)
                     found.append(WrongSection(segment, line.index, section, tuple(shown.tolist())))
-    return tuple(sorted(found, key=lambda one: -one.length_cm)), wrong / max(seen, 1)
+    return tuple(sorted(found, key=lambda one: (one.beside, -one.length_cm))), wrong / max(seen, 1)
 
 
 def held_out_frames(count: int, every: int, seed: int) -> Bool[np.ndarray, "n"]:

@@ -20,7 +20,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from datagen.slam.camera.self_calibration import MAX_FOCAL_SIGMA, MAX_STRAIN, MIN_REVISITS
 from lanenet.config import Settings
-from lanenet.data.maps.mapped_drive import DOUBTFUL
+from lanenet.data.maps.mapped_drive import AWAY, BETWEEN_LANES, DOUBTFUL, NOT_MAPPED
 from lanenet.errors import counted
 
 _log = logging.getLogger(__name__)
@@ -85,12 +85,13 @@ class MapEvidence:
         laps: Whole turns that the car has driven, or laps between revisits where these are more.
         strain: Distance of a found camera's principal point and roll from those of ordinary ones, and of its
             odometry from the closed loops, in sigmas.
-        alike: Whether places were seen twice, but do not tell how long a lap is.
+        missed: The part of the strain that is heading which odometry misses in a lap.
+        turn_open: Whether places were seen twice, but do not tell how far a lap turns.
         elsewhere: Frames outside the largest segment, which are not joined to it.
         pauses: How often the recording pauses, if it does so again and again.
         wrong_share: Share of the lines' length in sections that the images contradict.
-        wrong: These sections, in words.
-        comes_round: Whether the largest segment has most frames, and its road certainly ends where it begins.
+        wrong: These sections, in words, those of the driven lane first.
+        open_for: Why the largest segment is not certainly a closed road; empty where it is one.
         bend_lane_cm: Width of the lane in bends, if it is another one there; else None.
         open_lane_cm: Narrowest and widest tenth of a lane of many widths that has no straight; else None.
         outer_lane_cm: Lane width that the user gave, if the lines that are so far apart bound several lanes,
@@ -118,9 +119,10 @@ class MapEvidence:
     elsewhere: int
     pauses: int
     wrong_share: float
-    alike: bool = False
+    missed: float = 0.0
+    turn_open: bool = False
     wrong: tuple[str, ...] = ()
-    comes_round: bool = True
+    open_for: str = ""
     bend_lane_cm: float | None = None
     open_lane_cm: tuple[float, float] | None = None
     outer_lane_cm: float | None = None
@@ -286,6 +288,12 @@ _PAUSED = (
     "drive (Donkeycar: AUTO_RECORD_ON_THROTTLE = False)"
 )
 _LOOK = "look at the strip of frames in the report"
+_TURN_OPEN = "the road looks alike in more than one place, so that it is open how far a lap turns"
+#: Why frames have no labels where no label is doubted: cause and remedy.
+_APART = "record without long pauses; the notes of the report tell why each section is left out"
+_BESIDE = "the car drove beside the lane", "drive within one lane"
+_MISSING = dict.fromkeys((AWAY, BETWEEN_LANES), _BESIDE)
+_MISSING[NOT_MAPPED] = "nothing joins them to the map, or they show no lane", _APART
 #: Why labels are doubted, by kind of evidence (:data:`datagen.quality.label_error.KINDS`): cause and remedy.
 _DOUBTS = {
     "gaps": (
@@ -329,7 +337,7 @@ def judge(evidence: MapEvidence, settings: VerdictSettings) -> Verdict:
         remedy = found[0].remedy
         sentence = f"{found[0].cause}{more}; {sentence}. {remedy[:1].upper()}{remedy[1:]}"
     reasons = [f"{one.found}, expected {one.bound} ({one.name})" for one in found] or [held]
-    reasons += [f"withheld, where the images disagree with the map: {text}" for text in evidence.wrong[:2]]
+    reasons += [f"withheld, likely off by more than 3 cm: {text}" for text in evidence.wrong[:2]]
     return Verdict(grade, state, sentence, tuple(reasons), tuple(_remarks(evidence, settings)), table)
 
 
@@ -345,10 +353,10 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
         return "wrong in sections", ": its laps do not lie on one another"
     if e.wrong_share > _WRONG_SHARE:
         return "wrong in sections", f", of which the longest is {e.wrong[0]}" if e.wrong else ""
-    if not e.revisits or e.alike:
-        return "open", ": how long a lap is stays open" if e.alike else ": no place was certainly seen twice"
+    if not e.revisits or e.turn_open:
+        return "open", f": {_TURN_OPEN if e.turn_open else 'no loop was certainly closed'}"
     apart = f", but for {counted(e.elsewhere, 'frame')} that are not joined to it" if e.elsewhere else ""
-    return ("closed", apart) if e.comes_round else ("open", f": nothing certainly closes the lap{apart}")
+    return ("open", f": {e.open_for}{apart}") if e.open_for else ("closed", apart)
 
 
 def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
@@ -366,7 +374,7 @@ def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
         yield Check(
             "max_off", "{} of the labels are expected to be off by more than 3 cm", labels.off_3, s.max_off,
             _USABLE_OFF * s.max_off, "too many labels are expected to be wrong",
-            "look at the worst frames in the report; where the map is wrong, drive another lap",
+            f"look at the worst frames in the report{'' if e.laps >= 2 else ', or drive another lap'}",
         )  # fmt: skip
     for name, what, value, least, unit in (
         ("min_frames", "{} frames have labels", labels.labelled, s.min_frames, ""),
@@ -383,20 +391,20 @@ def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
         "min_in_view", "{} of the labels lie in the image", labels.in_view, s.min_in_view, None,
         "the camera sees few of the places that the labels are of",
         f"tilt the camera down, or, if it is not {e.ahead_cm:.0f} cm ahead of the front axle, give the car's "
-        "wheelbase (--wheelbase): the rest a network can only tell from what lies further ahead",
-        least=True,
+        "wheelbase (--wheelbase): the rest a network can only tell from what lies further ahead", least=True,
     )  # fmt: skip
     if e.coverage != e.coverage:
         yield Check(
-            "held_out_every", "{} frames were held out", 0, 1, None, "nothing has checked the lines",
-            "map a longer drive, or hold frames out from its lines", "", least=True,
+            "held_out_every", "{} held-out frames show a line of the map", 0, 1, None,
+            "nothing has checked the lines", "map a longer drive, or hold frames out", "", least=True,
         )  # fmt: skip
 
 
 def _more(e: MapEvidence) -> tuple[str, str]:
     """Why labels are few, and what to do."""
     labels = e.labels
-    if labels.labelled > (1.0 - _TOLD) * labels.frames:
+    # Frames beside the lane are no fault of the map, but there are no labels to be had from them.
+    if labels.labelled > (1.0 - _TOLD) * (labels.labelled + sum(labels.not_labelled.values())):
         laps = "" if e.laps >= 2 else ": two laps of the track, or more"
         return "the drive is short", f"drive longer{laps}"
     cause, remedy = _why_not(e)
@@ -416,40 +424,40 @@ def _why_not(e: MapEvidence) -> tuple[str, str]:
             return cause, _PAUSED.format(e.pauses)
         cause, remedy = _DOUBTS[kind]
         return cause, _LOOK if kind == "line" and e.laps >= 2 else remedy
-    return f"{count} lack them ({reason})" if reason else "unknown", _LOOK
+    return _MISSING.get(reason, (f"{count} lack them ({reason})" if reason else "unknown", _LOOK))
 
 
 def _camera(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     """Rows on a camera that was found, and on loops that were closed with it."""
     laps = "drive two laps of a closed road along the same path, or "
-    few = e.laps < 2 and e.revisits < MIN_REVISITS
-    why = ", for hardly a place was seen twice" if few else ""
-    if e.alike:
-        why = ", for the road looks alike in more than one place: how long a lap is stays open"
-    remedy = f"{laps if few and not e.alike else ''}{_CAMERA_FILE}"
+    few = e.laps < 2 and e.revisits < MIN_REVISITS and not e.turn_open
+    why = f": {_TURN_OPEN}" if e.turn_open else ", for hardly a place was seen twice" if few else ""
+    known = e.found_lane_cm is not None
+    remedy = "measure the camera (lanenet calibrate)" if known else f"{laps if few else ''}{_CAMERA_FILE}"
     height = ", or its height (--camera-height)" if e.given_height_cm is None else ""
     if e.closure_across_heights is not None:
         yield Check(
             "max_closure_heights", "revisits miss each other across the road by {} (median)",
             e.closure_across_heights, s.max_closure_heights, None, "the laps do not lie on one another",
-            remedy if e.sigma else _CHECK_CAMERA, "camera heights",
+            _CHECK_CAMERA if known else remedy, "camera heights",
         )  # fmt: skip
-    if not e.sigma:
-        return
+    by_heading = 2.0 * e.missed**2 > e.strain**2
     yield Check(
-        "max_strain", "the camera is {} from ordinary ones, by its principal point, its roll and the heading "
-        "that its odometry misses in a lap", e.strain, *MAX_STRAIN,
-        "the camera that fits the images is unlike ordinary ones, or its odometry is unlike the closed "
-        "loops, so that a place may have been taken for another that looks like it", _CAMERA_FILE, "sigmas",
+        "max_strain", f"the {'closed loops are' if by_heading else 'camera is'} {{}} from "
+        f"{'what its odometry turns' if by_heading else 'ordinary ones, by principal point or roll'}",
+        e.strain, *MAX_STRAIN,
+        "the car turned otherwise in a lap than the closed loops say: a place may have been taken for "
+        "another that looks like it" if by_heading
+        else "the camera that fits the images is unlike ordinary ones", _CAMERA_FILE, "sigmas",
     )  # fmt: skip
     for name, what, key, bound, unit in (
         ("max_focal_sigma", "focal length", "focal", s.max_focal_sigma, "%"),
         ("max_pitch_sigma_rad", "pitch", "pitch", s.max_pitch_sigma_rad, "rad"),
     ):
         yield Check(
-            name, f"the drive leaves the camera's {what} open by {{}}", e.sigma.get(key, 0.0), bound,
-            s.usable * bound, f"the drive does not show the camera's {what} well enough{why}",
-            remedy + height if key == "focal" else remedy, unit,
+            name, f"the camera's {what} is open by {{}}", e.sigma.get(key, 0.0), bound, s.usable * bound,
+            f"the {'camera file' if known else 'drive'} does not tell the camera's {what} well enough{why}",
+            remedy + height if key == "focal" and not known else remedy, unit,
         )  # fmt: skip
 
 
@@ -473,18 +481,15 @@ def _scale(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
             f"the lane is {low:.0f} to {high:.0f} cm wide and has no straight, so it is open which width is "
             f"{e.given_lane_cm:g} cm", "give a camera file (--camera), or drive a road that has a straight",
         )  # fmt: skip
-    if e.found_lane_cm is None and (asked := _other_width(e, s)) is not None:
-        yield asked
-    made = (
-        f"with a lane width of {e.given_lane_cm:.4g} cm, the camera would be {e.height_cm:.0f} cm high and "
-        f"the tape {e.tape_cm:.1f} cm wide, which cannot be"
-    )
+    known, wide = e.found_lane_cm is not None, f"{e.tape_cm:.1f} cm wide, which cannot be"
+    made, remedy = f"with this camera, the tape would be {wide}", _CHECK_CAMERA
+    if not known:
+        at_width = f"with a lane width of {e.given_lane_cm:.4g} cm, the camera would be"
+        made, remedy = f"{at_width} {e.height_cm:.0f} cm high and the tape {wide}", _WHICH_WIDTH
     # The height of a known camera is as it is.
-    for bound, what, value, _, _, (least, most) in lengths[e.found_lane_cm is not None :]:
+    for bound, what, value, _, _, (least, most) in lengths[known:]:
         end = least if value < least else most
-        yield Check(
-            bound, f"the {what} follows as {{}}", value, end, end, made, _WHICH_WIDTH, "cm", value < least
-        )
+        yield Check(bound, f"the {what} follows as {{}}", value, end, end, made, remedy, "cm", value < least)
 
 
 def _compared(
@@ -496,31 +501,6 @@ def _compared(
         max(value_cm / given_cm, given_cm / value_cm) - 1.0, good, usable,
         f"the {what} comes out as {value_cm:.1f} cm, not {given_cm:g} cm",
         "measure the lane between the middles of its two lines, the camera's height, and the tape",
-    )  # fmt: skip
-
-
-def _other_width(e: MapEvidence, s: VerdictSettings) -> Check | None:
-    """Ask about a lane width if half of it, or twice as much, would make a usual car."""
-    sizes_cm = ((e.height_cm, s.height_cm), (e.tape_cm, s.tape_cm))
-    # The bounds leave a factor of two on either side of what most cars have.
-    usual = (
-        share
-        for share in (1.0, 0.5, 2.0)
-        if all(2.0 * low <= share * cm <= 0.5 * high for cm, (low, high) in sizes_cm)
-    )
-    share = next(usual, 1.0)
-    if e.given_height_cm is not None or e.given_tape_cm is not None or share == 1.0:
-        return None
-    times, what = ("half", "of the whole road") if share < 1.0 else ("twice", "of half a lane")
-    made = f"camera {e.height_cm:.1f} cm high and the tape {e.tape_cm:.1f} cm wide"
-    return Check(
-        "usual size", f"the {made}, most cars have what {times} the lane width gives: off by {{}}", 1.0, 0.0,
-        None,
-        f"is {e.given_lane_cm:.4g} cm the width {what}? It makes the {made}; --lane-width "
-        f"{share * e.given_lane_cm:.4g} would make them {share * e.height_cm:.1f} and "
-        f"{share * e.tape_cm:.1f} cm, as on most cars",
-        "measure the lane between the middles of its two lines; if it is right, give the width of the tape "
-        "or the height of the camera as well (--tape-width, --camera-height)",
     )  # fmt: skip
 
 
@@ -541,10 +521,7 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
         yield _PAUSED.format(e.pauses)
     if e.tape_range_cm is not None and e.tape_range_cm[1] > (1.0 + s.lane_mismatch) * e.tape_range_cm[0]:
         low, high = e.tape_range_cm
-        yield (
-            f"the tape is {low:.1f} cm wide in some places and {high:.1f} cm in others: tape of several "
-            "widths, light that fades, or a floor that is not flat; then lengths are wrong by as much"
-        )
+        yield f"the tape is {low:.1f} cm wide in some places and {high:.1f} cm in others"
     if e.outer_lane_cm is not None:
         height_cm = e.height_cm * e.outer_lane_cm / e.given_lane_cm
         yield (
@@ -559,11 +536,15 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
             f"the lane is {width_cm:.1f} cm wide on straights and {e.bend_lane_cm:.1f} cm in bends; the lane "
             "width to give is that of the straights"
         )
-    # Where a length was measured a check compares it, and another asks about half and twice the width.
-    if (e.found_lane_cm, e.given_height_cm, e.given_tape_cm, _other_width(e, s)) == (None,) * 4:
+    # Where a length was measured a check compares it.
+    if (e.found_lane_cm, e.given_height_cm, e.given_tape_cm) == (None,) * 3:
+        # Which of both would make a more usual car, by the middle of what cars and tape can be.
+        usual_cm2 = (s.height_cm[0] * s.height_cm[1] * s.tape_cm[0] * s.tape_cm[1]) ** 0.5
+        share, road = (0.5, "the whole road") if e.height_cm * e.tape_cm > usual_cm2 else (2.0, "half a lane")
+        other = f"{share * e.height_cm:.1f} and {share * e.tape_cm:.1f} cm, if {road} was measured"
         yield (
             f"is it right that the camera is {e.height_cm:.1f} cm high and the tape {e.tape_cm:.1f} cm wide? "
             f"Both follow from the lane width of {e.given_lane_cm:.4g} cm, which no check here can show to "
-            "be wrong. Measure one of them with a ruler. If it differs, the lane width is wrong by the same "
-            "factor; --camera-height or --tape-width checks it for you"
+            f"be wrong (--lane-width {share * e.given_lane_cm:.4g} would make them {other}). Measure one of "
+            "them with a ruler; --camera-height or --tape-width checks it for you"
         )

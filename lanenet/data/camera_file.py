@@ -6,6 +6,7 @@ import datetime
 import logging
 import math
 import shlex
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -221,6 +222,38 @@ def write_camera(
     """
     checked = camera_data(camera, method, residuals, date, str(path))
     write_text(path, _dump(checked))
+
+
+#: Sigmas of a camera that was found from drives, among the residuals of its file: by the adjustment's names.
+_SIGMAS = {
+    "focal": "focal_sigma_px",
+    "cx": "cx_sigma_px",
+    "cy": "cy_sigma_px",
+    "k1": "k1_sigma",
+    "pitch": "pitch_down_sigma_rad",
+    "roll": "roll_sigma_rad",
+    "yaw": "yaw_sigma_rad",
+}
+
+
+def sigma_residuals(camera: Camera, sigma: Mapping[str, float]) -> dict[str, float]:
+    """Return a camera's sigmas as residuals of its file; that of the focal length is given relative to it."""
+    scale = {"focal": float(camera.K[0, 0])}
+    return {file: scale.get(name, 1.0) * sigma[name] for name, file in _SIGMAS.items() if name in sigma}
+
+
+def read_sigma(path: Path) -> dict[str, float]:
+    """Read the sigmas of a camera file, as :func:`sigma_residuals` takes them; empty if it has none.
+
+    Raises:
+        CalibrationError: As :func:`read_own_camera`.
+    """
+    if foreign_lens(path) is not None:
+        return {}
+    file = _read(CameraFile, path)
+    scale = {"focal": file.K[0][0]}
+    found = {name: file.residuals.get(key) for name, key in _SIGMAS.items()}
+    return {name: value / scale.get(name, 1.0) for name, value in found.items() if value is not None}
 
 
 def camera_data(

@@ -26,6 +26,8 @@ DRIVE_INSTEAD = (
     "drive two laps of a closed track, or of a figure of eight, without a pause, between two lines that the "
     "camera sees"
 )
+#: What helps where more laps do not.
+_MEASURE_INSTEAD = "measure the camera (lanenet calibrate print, chessboard, ground)"
 #: Moving frames that the adjustment needs. Chosen: ten seconds at 20 frames a second, less than any lap.
 MIN_FRAMES = 200
 #: Range of the heading below which focal length and pitch can only be told apart by a prior. Chosen: half a
@@ -135,6 +137,7 @@ class FoundCamera:
             "alike": self.solved.alike,
             "height_given": self.height_given,
             "strain": self.strain,
+            "missed": self.solved.missed,
         }
 
     @property
@@ -157,8 +160,8 @@ class FoundCamera:
         if self.height_given:
             return f"{found}; the focal length fits the lane width at the camera's height"
         if self.solved.revisits:
-            return f"{found}; the images do not tell how long a lap is, which leaves the lens open"
-        return f"{found}; no place was seen twice, so the lens is as it started"
+            return f"{found}; places that were seen twice look like others, which leaves the lens open"
+        return f"{found}; no loop was certainly closed, so the lens is as it started"
 
 
 def find_camera(drive: Drive, start: Camera | None, solver: SegmentSolver) -> FoundCamera:
@@ -312,6 +315,7 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
     solved = found.solved
     turned, length = turning_rad(solved.poses), solved.path_cm[-1] / found.camera.mounting.height_cm
     driven = f"{len(solved.poses)} frames, {length:.0f} camera heights long"
+    instead = DRIVE_INSTEAD if turned < 4.0 * np.pi else _MEASURE_INSTEAD
     problem = None
     if turned < MIN_TURNING_RAD:
         problem = (
@@ -320,13 +324,19 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
         )
     elif len(solved.revisits) < MIN_REVISITS:
         problem = (
-            f"{len(solved.revisits) or 'no'} places were seen twice, expected {MIN_REVISITS}: {driven}, with "
-            f"bends of {np.rad2deg(turned):.0f} degrees"
+            f"{len(solved.revisits) or 'no'} places were certainly seen twice, expected {MIN_REVISITS}: "
+            f"{driven}, with bends of {np.rad2deg(turned):.0f} degrees"
+        )
+    elif not found.closed:
+        problem, instead = (
+            f"{len(solved.revisits)} places were seen twice, but look like others along the road, so that it "
+            f"is open how far a lap turns: {driven}",
+            _MEASURE_INSTEAD,
         )
     if problem is not None:
         if not accept_open_loop:
             raise CalibrationError(
-                f"{where}: {problem}. Such a drive does not determine the focal length: {DRIVE_INSTEAD}, or "
+                f"{where}: {problem}. Such a drive does not determine the focal length: {instead}, or "
                 "accept a guessed one (--accept-open-loop)"
             )
         return [f"{problem}: the focal length is guessed, give or take {100.0 * found.sigma['focal']:.0f} %"]
@@ -336,14 +346,11 @@ def check_observable(found: FoundCamera, where: str, accept_open_loop: bool) -> 
         "road, such as lamps mirrored in the floor, or a place was taken for another"
     )
     if found.strain > MAX_STRAIN[1]:
-        raise CalibrationError(
-            f"{where}: {strained}. {DRIVE_INSTEAD.capitalize()}, without such things in view"
-        )
+        raise CalibrationError(f"{where}: {strained}; {_MEASURE_INSTEAD}")
     focal_sigma = found.sigma["focal"]
     if focal_sigma > MAX_FOCAL_SIGMA:
         raise CalibrationError(
             f"{where}: the focal length has a sigma of {100.0 * focal_sigma:.1f} % ({driven}, "
-            f"{len(solved.revisits)} revisits), expected at most {100.0 * MAX_FOCAL_SIGMA:.0f} %: "
-            f"{DRIVE_INSTEAD}"
+            f"{len(solved.revisits)} revisits), expected at most {100.0 * MAX_FOCAL_SIGMA:.0f} %: {instead}"
         )
     return [strained] if found.strain > MAX_STRAIN[0] else []

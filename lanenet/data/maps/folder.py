@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
 from lanenet.config import Settings, check_settings, read_yaml
-from lanenet.data.camera_file import MAP_CAMERA_NAME, read_own_camera, write_camera
+from lanenet.data.camera_file import MAP_CAMERA_NAME, read_own_camera, sigma_residuals, write_camera
 from lanenet.data.drives.recording import MAX_TIME_S
 from lanenet.data.files import require, write_json, write_text
 from lanenet.data.maps.frame_lines import FrameLanes, assign_lanes
@@ -214,7 +214,8 @@ def write_map(
         columns["image"] = m.marks
     write_csv(folder / "poses.csv", columns, allow_empty=("match", *_ERRORS))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
-    write_camera(folder / "camera.yaml", m.camera, how_calibrated)
+    sigma = report.get("calibration", {}).get("sigma") or report.get("camera_sigma", {})
+    write_camera(folder / "camera.yaml", m.camera, how_calibrated, sigma_residuals(m.camera, sigma))
     lines = [
         {
             "segment": segment,

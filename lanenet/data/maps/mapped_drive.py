@@ -39,6 +39,7 @@ _MAX_SIGMA_LANES = 0.04
 #: Why a frame gets no labels. The reports count frames under these keys.
 DELETED, NO_LINE = "deleted", "no line in the window"
 DOUBTFUL = "likely to be wrong"
+NOT_MAPPED = "segment not mapped"
 BETWEEN_LANES = "on the line between two lanes, or in a swerve beyond it"
 #: A wrong map puts the car there, too; so these frames count against the map.
 AWAY = "far beside the lane"

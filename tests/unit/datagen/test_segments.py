@@ -22,6 +22,7 @@ from datagen.slam.loops.revisits import Revisit
 from datagen.slam.odometry.scans import pack_scans
 from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.settings import GuessSettings
+from lanenet.data.camera_file import sigma_residuals, write_camera
 from lanenet.data.drives.recording import Drive
 from lanenet.data.files import write_json, write_text
 from lanenet.data.maps.line import LaneLine, Side
@@ -259,11 +260,18 @@ def test_nothing_is_said_where_all_is_mapped(monkeypatch):
     "report", [{"calibration": {"sigma": {"focal": 0.02}}}, {"camera_sigma": {"focal": 0.02}}]
 )
 def test_a_camera_of_an_earlier_map_brings_its_uncertainty_along(tmp_path, report):
+    camera = guessed_camera(160, 120, 80.0, 15.0, GuessSettings())
+    # Maps of earlier versions have them in their report alone.
+    write_camera(tmp_path / "camera.yaml", camera, "found")
     write_text(tmp_path / "map.yaml", "")
     write_json(tmp_path / "report.json", report)
     assert sigma_of_earlier(tmp_path) == sigma_of_earlier(tmp_path / "camera.yaml") == {"focal": 0.02}
-    # A camera that was measured, in no map.
-    assert sigma_of_earlier(tmp_path / "elsewhere" / "camera.yaml") == sigma_of_earlier(None) == {}
+    assert sigma_of_earlier(None) == {}
+    elsewhere = tmp_path / "elsewhere" / "car.yaml"
+    write_camera(elsewhere, camera, "measured")
+    assert sigma_of_earlier(elsewhere) == {}
+    write_camera(elsewhere, camera, "found", sigma_residuals(camera, {"focal": 0.03, "pitch": 0.01}))
+    assert sigma_of_earlier(elsewhere) == pytest.approx({"focal": 0.03, "pitch": 0.01})
     write_json(tmp_path / "report.json", {"calibration": {"sigma": {"focal": "wide"}}})
     with pytest.raises(MapFormatError, match=r"report\.json: sigmas of the camera"):
         sigma_of_earlier(tmp_path)
