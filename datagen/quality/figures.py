@@ -13,7 +13,7 @@ from datagen.lanes.find import MappedSegment
 from datagen.quality.measure import MapQuality
 from datagen.quality.residuals import coverage
 from datagen.quality.verdict import MapEvidence
-from datagen.slam.commands import BREAK_PERIODS, commands_of, fit_steering
+from datagen.slam.commands import BREAK_PERIODS, closest_steering, commands_of
 from datagen.slam.loops.pose_graph import revisit_residuals
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
@@ -66,6 +66,7 @@ def segment_figures(parts: list[MappedSegment], factor: float) -> list[dict[str,
                 "closure_across_cm": factor * float(np.median(missed)) if len(missed) else None,
                 "steering": None if solved.steering is None else vars(solved.steering),
                 "closed": part.lines[0].period_cm is not None,
+                "hanging": solved.hanging,
             }
         )
     return segments
@@ -75,20 +76,16 @@ def steering_answer(mapped: MappedDrive) -> float | None:
     """Correlate the path's curvature with the steering command, at the delay where that is strongest.
 
     Returns:
-        Below 0 where the car turns right when it is steered left; None if nothing was commanded, or if the
-        command does not explain the path.
+        Below 0 where the car turns right when it is steered left; None if nothing was commanded.
     """
     drive_map = mapped.drive_map
     commands = commands_of(mapped.drive, drive_map.camera.wheelbase_cm).only(mapped.rows)
     if commands.turn is None:
         return None
     periods, turn = np.where(mapped.starts, BREAK_PERIODS, commands.periods), commands.turn
-    found = []
-    for sign in (1.0, -1.0):
-        steered = replace(commands, periods=periods, turn=sign * turn)
-        fit = fit_steering(drive_map.poses, steered, drive_map.camera.mounting.height_cm)
-        found += [] if fit is None else [sign * fit.correlation]
-    return max(found, key=abs, default=None)
+    steered = {sign: replace(commands, periods=periods, turn=sign * turn) for sign in (1.0, -1.0)}
+    fits = {sign: closest_steering(drive_map.poses, one) for sign, one in steered.items()}
+    return max((sign * fit.correlation for sign, fit in fits.items() if fit), key=abs, default=None)
 
 
 def map_evidence(
@@ -112,6 +109,7 @@ def map_evidence(
     known = not calibration.get("candidates")
     found_cm = meta.mapped_lane_cm if free_cm is None else free_cm
     largest = int(np.argmax(frames))
+    loose = segments[largest].get("hanging", 0)  # reports of earlier versions do not know
     # As many times round as a circle is longer than the diagonal of the square around it.
     extent_cm = float(np.hypot(*np.ptp(drive_map.poses[drive_map.segment == largest, :2], axis=0)))
     rounds = segments[largest]["path_cm"] / max(extent_cm * np.pi / 2.0**0.5, 1.0)
@@ -147,7 +145,7 @@ def map_evidence(
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
-        elsewhere=int(frames.sum() - frames.max()) + quality.status.count(NOT_MAPPED),
+        elsewhere=int(frames.sum() - frames.max()) + quality.status.count(NOT_MAPPED) + loose,
         pauses=figures.get("pauses", 0),
     )
 
@@ -158,9 +156,8 @@ def tape_range_cm(lines: Sequence[LaneLine]) -> tuple[float, float] | None:
     for line in lines:
         known = line.supported(line.sigma_s_cm)
         if len(line.marking_at_cm) and known.any():
-            low, high = np.percentile(line.marking_at_cm[known], [5.0, 95.0])
-            ranges.append((float(low), float(high)))
-    return max(ranges, key=lambda ends: ends[1] / ends[0], default=None)
+            ranges.append(np.percentile(line.marking_at_cm[known], [5.0, 95.0]).tolist())
+    return max(map(tuple, ranges), key=lambda ends: ends[1] / ends[0], default=None)
 
 
 def map_notes(drive_map: DriveMap, segments: list[dict[str, Any]], frames: int, free: bool) -> list[str]:

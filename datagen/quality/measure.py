@@ -56,14 +56,9 @@ class WrongSection:
     frames: tuple[int, ...]
 
     @property
-    def beside(self) -> bool:
-        """Whether the line is none of the driven lane's."""
-        return self.index not in (0, 1)
-
-    @property
     def name(self) -> str:
         """Name of the line: that of its side, seen in the path's direction."""
-        return f"{SIDES[self.index > 0]} line{' of the adjacent lane' if self.beside else ''}"
+        return f"{SIDES[self.index > 0]} line{'' if self.index in (0, 1) else ' of the adjacent lane'}"
 
     @property
     def length_cm(self) -> float:
@@ -185,7 +180,8 @@ def wrong_sections(
                     shown = np.unique(frame[off & np.isin(place, run)])
                     section = (start, start + len(run) * place_cm)
                     found.append(WrongSection(segment, line.index, section, tuple(shown.tolist())))
-    return tuple(sorted(found, key=lambda one: (one.beside, -one.length_cm))), wrong / max(seen, 1)
+    found.sort(key=lambda one: (one.index not in (0, 1), -one.length_cm))
+    return tuple(found), wrong / max(seen, 1)
 
 
 def held_out_frames(count: int, every: int, seed: int) -> Bool[np.ndarray, "n"]:

@@ -87,7 +87,8 @@ class MapEvidence:
             odometry from the closed loops, in sigmas.
         missed: The part of the strain that is heading which odometry misses in a lap.
         turn_open: Whether places were seen twice, but do not tell how far a lap turns.
-        elsewhere: Frames outside the largest segment, which are not joined to it.
+        elsewhere: Frames outside the largest segment, which are not joined to it, and those of it that
+            revisits hold at one end alone.
         pauses: How often the recording pauses, if it does so again and again.
         wrong_share: Share of the lines' length in sections that the images contradict.
         wrong: These sections, in words, those of the driven lane first.
@@ -101,7 +102,7 @@ class MapEvidence:
         tape_range_cm: Narrowest and widest twentieth of the tape along the line on which it varies most; None
             if it is not known.
         steering: Correlation of the path's curvature with the steering command, both positive to the left;
-            None where it is too weak to tell, or nothing was commanded.
+            None where nothing was commanded.
     """
 
     labels: LabelEvidence
@@ -158,6 +159,8 @@ class VerdictSettings(Settings):
         max_pitch_sigma_rad: Sigma of the camera's pitch, if it was found from the drive. Chosen: 1.7 degrees;
             the principal point takes on most of what the pitch is off. Labels of ``donkey_circuit`` with
             cameras from two parts of it (sigma 0.013 and 0.017) lie 0.4 cm from those of the whole (0.022).
+        min_steering: Correlation of the path's curvature with the steering command, in either direction.
+            Measured: 0.97 and more on maps that are right of 30 simulated drives, 0.69 and none on wrong ones.
         max_closure_heights: Median error of a revisit across the road, in camera heights. A study of three
             recorded drives reached 0.03.
         lane_mismatch: Relative difference of the lane width that the camera measures, or of the tape's width
@@ -180,6 +183,7 @@ class VerdictSettings(Settings):
     min_in_view: float = Field(default=0.25, gt=0.0, lt=1.0)
     max_focal_sigma: PositiveFloat = MAX_FOCAL_SIGMA
     max_pitch_sigma_rad: float = Field(default=0.03, gt=0.0)
+    min_steering: float = Field(default=0.5, gt=0.0, lt=1.0)
     max_closure_heights: float = Field(default=0.15, gt=0.0)
     lane_mismatch: float = Field(default=0.25, gt=0.0)
     usable: float = Field(default=2.0, gt=1.0)
@@ -355,7 +359,9 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
         return "wrong in sections", f", of which the longest is {e.wrong[0]}" if e.wrong else ""
     if not e.revisits or e.turn_open:
         return "open", f": {_TURN_OPEN if e.turn_open else 'no loop was certainly closed'}"
-    apart = f", but for {counted(e.elsewhere, 'frame')} that are not joined to it" if e.elsewhere else ""
+    apart = (
+        f", but for {counted(e.elsewhere, 'frame')} joined at one end or not at all" if e.elsewhere else ""
+    )
     return ("open", f": {e.open_for}{apart}") if e.open_for else ("closed", apart)
 
 
@@ -363,6 +369,12 @@ def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
     """Yield the table of checks: causes before what comes of them."""
     yield from _scale(e, s)
     yield from _camera(e, s)
+    if e.steering is not None:
+        yield Check(
+            "min_steering", "path and steering correlate by {}", abs(e.steering), s.min_steering,
+            s.min_steering / s.usable, "the path on the map is not the way that was steered",
+            f"{_LOOK}: lamps mirrored in the floor hold a path back", "", least=True,
+        )  # fmt: skip
     labels, more = e.labels, _more(e)
     yield Check(
         "max_outside", "both lines lie beside the window in {} of the frames", labels.outside_share,
@@ -420,8 +432,7 @@ def _why_not(e: MapEvidence) -> tuple[str, str]:
     # What speaks against labels is no cause where frames lack them for another reason.
     if kind in _DOUBTS and reason in ("", DOUBTFUL) and (kind != "camera" or e.sigma):
         if kind == "gaps" and e.pauses:
-            cause = "they lie beside pauses of the recording, where the car's pose is uncertain"
-            return cause, _PAUSED.format(e.pauses)
+            return "they lie beside pauses, where the car's pose is uncertain", _PAUSED.format(e.pauses)
         cause, remedy = _DOUBTS[kind]
         return cause, _LOOK if kind == "line" and e.laps >= 2 else remedy
     return _MISSING.get(reason, (f"{count} lack them ({reason})" if reason else "unknown", _LOOK))
@@ -520,8 +531,7 @@ def _remarks(e: MapEvidence, s: VerdictSettings) -> Iterator[str]:
     if e.pauses and _PAUSED.format(e.pauses) != _why_not(e)[1]:
         yield _PAUSED.format(e.pauses)
     if e.tape_range_cm is not None and e.tape_range_cm[1] > (1.0 + s.lane_mismatch) * e.tape_range_cm[0]:
-        low, high = e.tape_range_cm
-        yield f"the tape is {low:.1f} cm wide in some places and {high:.1f} cm in others"
+        yield "the tape is {:.1f} cm wide in some places and {:.1f} cm in others".format(*e.tape_range_cm)
     if e.outer_lane_cm is not None:
         height_cm = e.height_cm * e.outer_lane_cm / e.given_lane_cm
         yield (

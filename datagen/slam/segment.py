@@ -34,6 +34,7 @@ from datagen.slam.loops.parts import (
     LEAST_TIED,
     carried,
     connected,
+    hanging,
     joined_twice,
     placing_revisits,
     tied_frames,
@@ -180,6 +181,12 @@ class SolvedSegment:
     def laps(self) -> Int[np.ndarray, "n"]:
         """Lap of each frame, from 0."""
         return count_laps(self.path_cm, self.revisits_within_parts)
+
+    @property
+    def hanging(self) -> int:
+        """Number of frames that revisits hold at one end alone."""
+        height_cm = self.camera.mounting.height_cm
+        return int(np.sum(hanging(self.poses, self.part, self.revisits, height_cm)))
 
     @property
     def revisits_within_parts(self) -> list[Revisit]:

@@ -34,6 +34,9 @@ _CARRIED_HEIGHTS, _ELSEWHERE = 3.5, 0.01
 #: Log likelihood at most of places that agree, over places that look alike as a whole, as those of parallel
 #: corridors. Chosen: it outweighs one break over which the car went elsewhere, but not two.
 JOINED = 6.0
+#: Way beyond a revisit over which odometry holds poses, in camera heights. Chosen: as far as revisits are
+#: looked for beside others.
+_HELD_HEIGHTS = 12.0
 #: Frames of a part that show the road, without which its poses are not determined. Chosen: the motion model
 #: holds only changes of speed and of turn, which takes three frames; speed and turn themselves are left to
 #: the images, and a fourth frame checks them.
@@ -127,6 +130,30 @@ def joined_twice(
             if len(np.unique(group[(part == a) | (part == b)])) > 1:
                 kept = others
     return kept
+
+
+def hanging(
+    poses: Float[np.ndarray, "n 3"],
+    part: Int[np.ndarray, "n"],
+    revisits: Sequence[Revisit],
+    camera_height_cm: float,
+) -> Bool[np.ndarray, "n"]:
+    """Return which frames are held at one end alone: beyond the first or the last revisit of their part.
+
+    Args:
+        poses: Poses.
+        part: Part of the drive that each frame belongs to.
+        revisits: Revisits.
+        camera_height_cm: Sets the scale.
+    """
+    path, loose = path_lengths(poses), np.ones(len(part), dtype=bool)
+    held = np.array([end for r in revisits for end in (r.earlier, r.later)], dtype=np.int64)
+    for number in np.unique(part[held]):
+        rows, reach_cm = np.flatnonzero(part == number), _HELD_HEIGHTS * camera_height_cm
+        ends_cm = path[held[part[held] == number]]
+        beyond_cm = np.maximum(ends_cm.min() - path[rows], path[rows] - ends_cm.max())
+        loose[rows] = beyond_cm > reach_cm
+    return loose
 
 
 def carried(poses: Float[np.ndarray, "n 3"], breaks: Int[np.ndarray, "b"], camera_height_cm: float) -> float:

@@ -203,6 +203,14 @@ def test_strain_is_told_by_what_most_of_it_is(missed, said):
     assert row.name == "max_strain" and said in row.cause
 
 
+@pytest.mark.parametrize(
+    ("steering", "grade"),
+    [(None, None), (0.97, None), (-0.9, None), (0.3, "usable"), (-0.3, "usable"), (0.1, "reject")],
+)
+def test_a_path_that_is_not_the_way_that_was_steered_is_no_map(steering, grade):
+    assert off(steering=steering) == ({} if grade is None else {"min_steering": grade})
+
+
 def test_an_earlier_maps_camera_is_judged_by_its_sigmas():
     assert off(KNOWN, sigma={"focal": 0.08}) == {"max_focal_sigma": "usable"}
     assert "lanenet calibrate" in judged(KNOWN, sigma={"focal": 0.3}).sentence

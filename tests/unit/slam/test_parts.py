@@ -13,7 +13,7 @@ from datagen.settings import MapSettings
 from datagen.slam.adjustment.adjust import BundleSettings
 from datagen.slam.commands import BREAK_PERIODS, commands_of, habitual_pauses
 from datagen.slam.filter.dp_slam import FilterSettings
-from datagen.slam.loops.parts import connected, joined_twice, placing_revisits, tied_frames
+from datagen.slam.loops.parts import connected, hanging, joined_twice, placing_revisits, tied_frames
 from datagen.slam.loops.pose_graph import close_loops, loop_pairs
 from datagen.slam.loops.revisits import Revisit, RevisitSettings
 from datagen.slam.segment import SegmentSolver, SolvedSegment
@@ -234,3 +234,15 @@ def test_a_recording_of_single_frames_is_refused_in_one_line():
     broken = replace(drive, t_s=drive.t_s + 10.0 * k, breaks=k > 0)
     with pytest.raises(TrackingLostError, match=r"20 frames in 20 parts between breaks, none with 4 frames"):
         SegmentSolver(SMALL, np.random.default_rng(0)).solve(broken, _camera())
+
+
+def test_what_lies_beyond_the_last_revisit_of_a_part_hangs_on_it():
+    # Two passes of a straight, the second one in a part of its own, tied to the first over its first half.
+    poses = np.column_stack([np.tile(np.arange(100) * 3.0, 2), np.zeros(200), np.zeros(200)])
+    part = np.repeat([0, 1], 100)
+    tied = [Revisit(k, 100 + k, np.zeros(3), 0.9) for k in range(0, 50, 5)]
+    # 12 heights of 5 cm are 20 frames of 3 cm.
+    loose = np.flatnonzero(hanging(poses, part, tied, 5.0))
+    assert loose.tolist() == [*range(66, 100), *range(166, 200)]
+    assert not hanging(poses, part, [*tied, Revisit(99, 199, np.zeros(3), 0.9)], 5.0).any()
+    assert hanging(poses, part, [], 5.0).all()
