@@ -34,6 +34,7 @@ from lanenet.perception.network.model_file import (
     BATCH_NAME,
     HASH_NAME,
     INPUT_NAME,
+    LOG_SHARE_NAME,
     MARKER_NAME,
     MODEL_NAME,
     OUTPUT_NAMES,
@@ -41,6 +42,7 @@ from lanenet.perception.network.model_file import (
     SELF_TEST_TOLERANCE,
     WIDTH_NAME,
     ModelMeta,
+    answers_of,
     is_model,
     open_model,
     sealed,
@@ -384,7 +386,7 @@ def _to_onnx(deployed: DeployedLaneNet, meta: ModelMeta) -> onnx.ModelProto:
             external_data=False,
             opset_version=OPSET,
             input_names=inputs,
-            output_names=list(OUTPUT_NAMES),
+            output_names=[*OUTPUT_NAMES, *([] if deployed.network.bins_cm is None else [LOG_SHARE_NAME])],
             dynamic_shapes=tuple(shapes),
         )
     if program is None:
@@ -480,7 +482,7 @@ def _largest_difference(
         for given in feeds:
             with torch.inference_mode():
                 expected = deployed(torch.from_numpy(some), *(torch.from_numpy(w) for w in given.values()))
-            found = session.run(OUTPUT_NAMES, {INPUT_NAME: some} | given)
+            found = session.run(answers_of(session), {INPUT_NAME: some} | given)
             off += [np.max(np.abs(np.asarray(f) - e.numpy())) for f, e in zip(found, expected, strict=True)]
     # Not Python's max(), which ignores NaN.
     return float(np.max(off))

@@ -155,7 +155,10 @@ class LaneNet(nn.Module):
 
 
 class DeployedLaneNet(nn.Module):
-    """What the ONNX file holds: bytes in; points, sigma, presence, parabolas, centre and steering out."""
+    """What the ONNX file holds: bytes in; points, sigma, presence, parabolas, centre and steering out.
+
+    With the shares of places after them, where the network has them.
+    """
 
     def __init__(self, network: LaneNet) -> None:
         super().__init__()
@@ -166,14 +169,7 @@ class DeployedLaneNet(nn.Module):
 
     def forward(
         self, raster: UInt8[Tensor, "n p r c"], lane_cm: Float[Tensor, "w"] | None = None
-    ) -> tuple[
-        Float[Tensor, "n 6"],
-        Float[Tensor, "n 6"],
-        Float[Tensor, "n 2"],
-        Float[Tensor, "n 2 3"],
-        Float[Tensor, "n 1"],
-        Float[Tensor, "n 1"],
-    ]:
+    ) -> tuple[Tensor, ...]:
         """Find the lane in rasters.
 
         Args:
@@ -182,8 +178,9 @@ class DeployedLaneNet(nn.Module):
 
         Returns:
             The six points, [cm]; their sigmas, [cm]; probability that the left and the right line can be
-            seen; (a, b, c) of the left and right parabola; x of the lane centre at 15 cm, [cm];
-            the steering target, [rad], positive left.
+            seen; (a, b, c) of the left and right parabola, n x 2 x 3; x of the lane centre at 15 cm, [cm];
+            the steering target, [rad], positive left; the log probability of each place of each point,
+            n x 6 x b, from a network with bins.
 
         Source:
             Steering: Kozlowski et al. 2024, eq. 3. The centre is ahead, so atan equals atan2 here.
@@ -194,14 +191,9 @@ class DeployedLaneNet(nn.Module):
         centre = lines[:, :, middle_row].mean(dim=1, keepdim=True)
         steering = torch.atan(-centre / LOOKAHEAD_CM)
         presence = torch.sigmoid(output.presence_logit)
-        return (
-            output.points_cm,
-            output.sigma_cm,
-            presence,
-            lines @ self.parabola_from_points,
-            centre,
-            steering,
-        )
+        parabolas = lines @ self.parabola_from_points
+        answers = output.points_cm, output.sigma_cm, presence, parabolas, centre, steering
+        return answers if output.log_share is None else (*answers, output.log_share)
 
 
 def input_of_rasters(rasters: UInt8[Tensor, "n p r c"]) -> Float[Tensor, "n p r c"]:

@@ -52,6 +52,8 @@ WIDTH_NAME = "lane_width_cm"
 #: The dimension of inputs and outputs that counts the rasters.
 BATCH_NAME = "n"
 OUTPUT_NAMES = ("points_cm", "sigma_cm", "presence", "parabolas", "centre_cm", "steering_rad")
+#: Optional output: log probabilities of places from the left to the right end of the window, of each point.
+LOG_SHARE_NAME = "log_share"
 #: Stands for the cameras of a model that was trained with many.
 ANY_CAMERA = "any"
 #: Error of a lane width that was measured on the floor; chosen: half a centimetre of a ruler's reading.
@@ -450,9 +452,20 @@ def _check_graph(session: onnxruntime.InferenceSession, meta: ModelMeta, where: 
         raise ModelMismatchError(
             f"{where}: {has} input {WIDTH_NAME}, but its description says takes_width: {meta.takes_width}"
         )
-    outputs = [o.name for o in session.get_outputs()]
+    outputs = {o.name: list(o.shape[1:]) for o in session.get_outputs()}
     if not set(OUTPUT_NAMES) <= set(outputs):
-        raise ModelMismatchError(f"{where}: outputs {outputs}, expected {list(OUTPUT_NAMES)}")
+        raise ModelMismatchError(f"{where}: outputs {list(outputs)}, expected {list(OUTPUT_NAMES)}")
+    shares = outputs.get(LOG_SHARE_NAME)
+    if shares is not None and not (len(shares) == 2 and shares[0] == N_POINTS and isinstance(shares[1], int)):
+        raise ModelMismatchError(
+            f"{where}: output {LOG_SHARE_NAME} of shape {shares}, expected {N_POINTS} x a number of places"
+        )
+
+
+def answers_of(session: onnxruntime.InferenceSession) -> tuple[str, ...]:
+    """Return the outputs that a model has: :data:`OUTPUT_NAMES`, and the shares of places if it has them."""
+    there = {output.name for output in session.get_outputs()}
+    return (*OUTPUT_NAMES, *({LOG_SHARE_NAME} & there))
 
 
 def read_model_meta(path: Path) -> ModelMeta:
