@@ -135,7 +135,7 @@ def _in_order(lines: list[LaneLine]) -> list[LaneLine]:
         first -= 1
     while last + 1 in found and found[last].lies_left_of(found[last + 1]):
         last += 1
-    return [found[index] for index in range(first, last + 1)]
+    return [line for line in lines if first <= line.index <= last]
 
 
 def _laps(segment: SolvedSegment, path: Path) -> Int[np.ndarray, "n"]:

@@ -248,7 +248,7 @@ def test_a_line_of_the_next_lane_on_the_wrong_side_is_left_out_with_those_beyond
     left, right = _map(monkeypatch, made_up_drive(200)).segments[0].lines
     next_one, beyond = replace(left, side="right", rank=1), replace(right, side="right", rank=2)
     assert _in_order([left, right, next_one, beyond]) == [left, right]
-    assert _in_order([replace(left, rank=1), left, right]) == [left, right]
+    assert _in_order([left, right, replace(left, rank=1)]) == [left, right]
 
 
 def test_nothing_is_said_where_all_is_mapped(monkeypatch):
