@@ -67,7 +67,11 @@ def rescaled(folder: Path, prepared: PreparedDrive) -> Solved | None:
     factor, sizes = prepared.request.lane_width_cm / width_cm, prepared.settings.verdict
     height_cm, tape_cm = earlier.drive_map.camera.mounting.height_cm, earlier.drive_map.meta.tape_cm
     # As find_lane_width has it: of half the lane, camera and tape would be twice as large.
-    if factor < 1.0 and (2.0 * height_cm > sizes.height_cm[1] or 2.0 * tape_cm > sizes.tape_cm[1]):
+    was, now = (
+        2.0 * share * height_cm > sizes.height_cm[1] or 2.0 * share * tape_cm > sizes.tape_cm[1]
+        for share in (1.0, factor)
+    )
+    if was and not now:
         return None
     figures = {name: report[name] for name in _KEPT_FIGURES if name in report}
     sigma = figures.get("calibration", {}).get("sigma", {})

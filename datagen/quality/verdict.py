@@ -356,7 +356,7 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
     if (e.closure_across_heights or 0.0) > s.max_closure_heights:
         return "wrong in sections", ": its laps do not lie on one another"
     if e.wrong_share > _WRONG_SHARE:
-        return "wrong in sections", f", of which the longest is {e.wrong[0]}" if e.wrong else ""
+        return "wrong in sections", f" without labels, the longest {e.wrong[0]}" if e.wrong else ""
     if not e.revisits or e.turn_open:
         return "open", f": {_TURN_OPEN if e.turn_open else 'no loop was certainly closed'}"
     apart = (
@@ -375,7 +375,7 @@ def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
             s.min_steering / s.usable, "the path on the map is not the way that was steered",
             f"{_LOOK}: lamps mirrored in the floor hold a path back", "", least=True,
         )  # fmt: skip
-    labels, more = e.labels, _more(e)
+    labels, more = e.labels, _more(e, s)
     yield Check(
         "max_outside", "both lines lie beside the window in {} of the frames", labels.outside_share,
         s.max_outside, s.usable * s.max_outside,
@@ -412,16 +412,16 @@ def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
         )  # fmt: skip
 
 
-def _more(e: MapEvidence) -> tuple[str, str]:
+def _more(e: MapEvidence, s: VerdictSettings) -> tuple[str, str]:
     """Why labels are few, and what to do."""
     labels = e.labels
-    # Frames beside the lane are no fault of the map, but there are no labels to be had from them.
-    if labels.labelled > (1.0 - _TOLD) * (labels.labelled + sum(labels.not_labelled.values())):
+    # Of frames beside the lane there are no labels to be had.
+    frames = labels.labelled + sum(labels.not_labelled.values())
+    if labels.labelled > (1.0 - _TOLD) * frames or 0 < labels.labelled <= frames < s.min_frames:
         laps = "" if e.laps >= 2 else ": two laps of the track, or more"
         return "the drive is short", f"drive longer{laps}"
     cause, remedy = _why_not(e)
-    none = f"no frame has labels: {cause}"
-    return f"few frames have labels: {cause}" if labels.labelled else none, remedy
+    return f"few frames have labels: {cause}" if labels.labelled else f"no frame has labels: {cause}", remedy
 
 
 def _why_not(e: MapEvidence) -> tuple[str, str]:
