@@ -13,7 +13,7 @@ from datagen.lanes.find import MappedSegment
 from datagen.quality.measure import MapQuality
 from datagen.quality.residuals import coverage
 from datagen.quality.verdict import MapEvidence
-from datagen.slam.commands import BREAK_PERIODS, closest_steering, commands_of
+from datagen.slam.commands import BREAK_PERIODS, commands_of, fit_steering
 from datagen.slam.loops.pose_graph import revisit_residuals
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
@@ -76,16 +76,20 @@ def steering_answer(mapped: MappedDrive) -> float | None:
     """Correlate the path's curvature with the steering command, at the delay where that is strongest.
 
     Returns:
-        Below 0 where the car turns right when it is steered left; None if nothing was commanded.
+        Below 0 where the car turns right when it is steered left; None if nothing was commanded, or if the
+        command does not explain the path.
     """
     drive_map = mapped.drive_map
     commands = commands_of(mapped.drive, drive_map.camera.wheelbase_cm).only(mapped.rows)
     if commands.turn is None:
         return None
     periods, turn = np.where(mapped.starts, BREAK_PERIODS, commands.periods), commands.turn
-    steered = {sign: replace(commands, periods=periods, turn=sign * turn) for sign in (1.0, -1.0)}
-    fits = {sign: closest_steering(drive_map.poses, one) for sign, one in steered.items()}
-    return max((sign * fit.correlation for sign, fit in fits.items() if fit), key=abs, default=None)
+    found = []
+    for sign in (1.0, -1.0):
+        steered = replace(commands, periods=periods, turn=sign * turn)
+        fit = fit_steering(drive_map.poses, steered, drive_map.camera.mounting.height_cm)
+        found += [] if fit is None else [sign * fit.correlation]
+    return max(found, key=abs, default=None)
 
 
 def map_evidence(
@@ -107,8 +111,7 @@ def map_evidence(
     across_cm = sum((segment["closure_across_cm"] or 0.0) * segment["revisits"] for segment in segments)
     # A given camera that the drive has refined counts as known: its lens was not searched for.
     known = not calibration.get("candidates")
-    found_cm = meta.mapped_lane_cm if free_cm is None else free_cm
-    largest = int(np.argmax(frames))
+    largest, steps_cm = int(np.argmax(frames)), np.diff(drive_map.poses, axis=0)
     loose = segments[largest].get("hanging", 0)  # reports of earlier versions do not know
     # As many times round as a circle is longer than the diagonal of the square around it.
     extent_cm = float(np.hypot(*np.ptp(drive_map.poses[drive_map.segment == largest, :2], axis=0)))
@@ -135,7 +138,7 @@ def map_evidence(
         given_lane_cm=meta.lane_width_cm,
         bend_lane_cm=figures["lane_width"]["bend_cm"],
         open_lane_cm=figures["lane_width"]["open_cm"],
-        found_lane_cm=None if meta.scale_from == "lane width" else found_cm,
+        found_lane_cm=None if meta.scale_from == "lane width" else free_cm or meta.mapped_lane_cm,
         height_cm=height_cm,
         tape_cm=meta.tape_cm,
         # The map of a known camera has another lane width than the given one only then.
@@ -146,6 +149,7 @@ def map_evidence(
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
         elsewhere=int(frames.sum() - frames.max()) + quality.status.count(NOT_MAPPED) + loose,
+        speed_cm_s=float(np.median(np.hypot(*steps_cm[:, :2].T)) / np.median(np.diff(drive_map.t_s))),
         pauses=figures.get("pauses", 0),
     )
 

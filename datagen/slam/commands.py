@@ -171,22 +171,10 @@ def delayed(values: Float[np.ndarray, "n"], frames: int) -> Float[np.ndarray, "n
 def fit_steering(
     poses: Float[np.ndarray, "n 3"], commands: CommandedMotion, camera_height_cm: float
 ) -> SteeringFit | None:
-    """Regress the curvature of a trajectory on the command, as :func:`closest_steering`.
-
-    Returns:
-        None, too, where the command does not explain the curvature.
-    """
-    best = closest_steering(poses, commands)
-    if best is None or not best.correlation > _LEAST_CORRELATION:
-        return None
-    return best if abs(best.trim_per_cm) < _MOST_TRIM_HEIGHTS / camera_height_cm else None
-
-
-def closest_steering(poses: Float[np.ndarray, "n 3"], commands: CommandedMotion) -> SteeringFit | None:
     """Regress the curvature of a trajectory on the command, at the delay with the highest correlation.
 
     Returns:
-        None where there is no command, it hardly changes, or the car hardly moves.
+        None where there is no command, it hardly changes, or it does not explain the curvature.
     """
     if commands.turn is None or np.std(commands.turn) < 1e-6:
         return None
@@ -205,4 +193,6 @@ def closest_steering(poses: Float[np.ndarray, "n 3"], commands: CommandedMotion)
         if best is None or r > best.correlation:
             gain, trim = np.polyfit(turn, curvature, 1)
             best = SteeringFit(float(gain), float(trim), lag, r)
-    return best
+    if best is None or not best.correlation > _LEAST_CORRELATION:
+        return None
+    return best if abs(best.trim_per_cm) < _MOST_TRIM_HEIGHTS / camera_height_cm else None

@@ -233,12 +233,16 @@ _SIGMAS = {
     "pitch": "pitch_down_sigma_rad",
     "roll": "roll_sigma_rad",
     "yaw": "yaw_sigma_rad",
+    "lever": "ahead_of_front_axle_sigma_cm",
 }
 
 
 def sigma_residuals(camera: Camera, sigma: Mapping[str, float]) -> dict[str, float]:
-    """Return a camera's sigmas as residuals of its file; that of the focal length is given relative to it."""
-    scale = {"focal": float(camera.K[0, 0])}
+    """Return a camera's sigmas as residuals of its file.
+
+    That of the focal length is given relative to it, that of its place along the car in camera heights.
+    """
+    scale = {"focal": float(camera.K[0, 0]), "lever": camera.mounting.height_cm}
     return {file: scale.get(name, 1.0) * sigma[name] for name, file in _SIGMAS.items() if name in sigma}
 
 
@@ -251,7 +255,7 @@ def read_sigma(path: Path) -> dict[str, float]:
     if foreign_lens(path) is not None:
         return {}
     file = _read(CameraFile, path)
-    scale = {"focal": file.K[0][0]}
+    scale = {"focal": file.K[0][0], "lever": file.mounting.height_cm}
     found = {name: file.residuals.get(key) for name, key in _SIGMAS.items()}
     return {name: value / scale.get(name, 1.0) for name, value in found.items() if value is not None}
 

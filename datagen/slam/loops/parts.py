@@ -34,9 +34,9 @@ _CARRIED_HEIGHTS, _ELSEWHERE = 3.5, 0.01
 #: Log likelihood at most of places that agree, over places that look alike as a whole, as those of parallel
 #: corridors. Chosen: it outweighs one break over which the car went elsewhere, but not two.
 JOINED = 6.0
-#: Way beyond a revisit over which odometry holds poses, in camera heights. Chosen: as far as revisits are
-#: looked for beside others.
-_HELD_HEIGHTS = 12.0
+#: Way beyond a revisit over which odometry holds poses, in camera heights. Chosen: less than half of that
+#: over which revisits are looked for beside others, so that those of a lap hold all of it.
+_HELD_HEIGHTS = 5.0
 #: Frames of a part that show the road, without which its poses are not determined. Chosen: the motion model
 #: holds only changes of speed and of turn, which takes three frames; speed and turn themselves are left to
 #: the images, and a fourth frame checks them.

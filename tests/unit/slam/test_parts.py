@@ -241,8 +241,8 @@ def test_what_lies_beyond_the_last_revisit_of_a_part_hangs_on_it():
     poses = np.column_stack([np.tile(np.arange(100) * 3.0, 2), np.zeros(200), np.zeros(200)])
     part = np.repeat([0, 1], 100)
     tied = [Revisit(k, 100 + k, np.zeros(3), 0.9) for k in range(0, 50, 5)]
-    # 12 heights of 5 cm are 20 frames of 3 cm.
-    loose = np.flatnonzero(hanging(poses, part, tied, 5.0))
+    # 5 heights of 12 cm are 20 frames of 3 cm.
+    loose = np.flatnonzero(hanging(poses, part, tied, 12.0))
     assert loose.tolist() == [*range(66, 100), *range(166, 200)]
-    assert not hanging(poses, part, [*tied, Revisit(99, 199, np.zeros(3), 0.9)], 5.0).any()
-    assert hanging(poses, part, [], 5.0).all()
+    assert not hanging(poses, part, [*tied, Revisit(99, 199, np.zeros(3), 0.9)], 12.0).any()
+    assert hanging(poses, part, [], 12.0).all()
