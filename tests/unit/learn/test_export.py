@@ -22,7 +22,15 @@ from lanenet.learn import export
 from lanenet.learn.config import LearnSettings, NetworkSettings
 from lanenet.learn.export import export_checkpoint, export_onnx, read_network, write_rasters, write_weights
 from lanenet.learn.network import DeployedLaneNet, input_of_rasters, new_network
-from lanenet.perception.network.model_file import ModelMeta, read_model_meta, sealed
+from lanenet.perception.network.model_file import (
+    LOG_SHARE_NAME,
+    OUTPUT_NAMES,
+    ModelMeta,
+    answers_of,
+    open_model,
+    read_model_meta,
+    sealed,
+)
 
 torch.set_num_threads(1)
 
@@ -78,6 +86,21 @@ def test_onnx_agrees_with_torch_for_any_batch(checkpoint, n):
     for f, e in zip(found, expected, strict=True):
         assert f.shape == tuple(e.shape)
         np.testing.assert_allclose(f, e.numpy(), atol=1e-3)
+
+
+def test_a_network_with_bins_answers_with_the_probability_of_each_place(tmp_path):
+    network = new_network(NetworkSettings(bins=16), WINDOW.rows, WINDOW.columns, 1).eval()
+    network.spread_bins(WINDOW.left_cm, WINDOW.right_cm)
+    export_onnx(network, META, RASTERS, tmp_path / "m.onnx")
+    session, _ = open_model(tmp_path / "m.onnx")
+    names = answers_of(session)
+    assert names == (*OUTPUT_NAMES, LOG_SHARE_NAME)
+    found = dict(zip(names, session.run(names, {"raster": RASTERS}), strict=True))
+    share = np.exp(found[LOG_SHARE_NAME])
+    assert share.shape == (len(RASTERS), 6, 16)
+    np.testing.assert_allclose(share.sum(axis=2), 1.0, atol=1e-5)
+    places_cm = np.linspace(WINDOW.left_cm, WINDOW.right_cm, 16)
+    np.testing.assert_allclose(share @ places_cm, found["points_cm"], atol=1e-3)
 
 
 def test_the_file_describes_itself(checkpoint):
