@@ -25,6 +25,7 @@ from datagen.slam.segment import SegmentSolver, SolvedSegment
 from datagen.slam.view import LEAST_POINTS
 from lanenet.data.camera_file import MAP_CAMERA_NAME, read_sigma
 from lanenet.data.drives import Drive
+from lanenet.data.maps.folder import sigma_in_report
 from lanenet.data.segments import equal_runs
 from lanenet.errors import CalibrationError, MapFormatError, TrackingLostError, counted
 from lanenet.geometry.camera import Camera
@@ -160,8 +161,7 @@ def sigma_of_earlier(camera_path: Path | None) -> dict[str, float]:
         return found
     report = read_json(report_path, MapFormatError)
     with parsing(f"{report_path}: sigmas of the camera", MapFormatError):
-        found = report.get("calibration", {}).get("sigma") or report.get("camera_sigma", {})
-        return {str(name): float(value) for name, value in found.items()}
+        return {str(name): float(value) for name, value in sigma_in_report(report).items()}
 
 
 def fit_height(

@@ -189,6 +189,12 @@ class DriveMap:
         return FrameLanes(lane, forward, between, away, divides)
 
 
+def sigma_in_report(report: dict[str, Any]) -> dict[str, float]:
+    """Return the sigmas of a map's camera, found from its drive or brought along; empty for an exact one."""
+    sigma: dict[str, float] = report.get("calibration", {}).get("sigma") or report.get("camera_sigma", {})
+    return sigma
+
+
 def write_map(
     folder: Path,
     drive_map: DriveMap,
@@ -214,8 +220,8 @@ def write_map(
         columns["image"] = m.marks
     write_csv(folder / "poses.csv", columns, allow_empty=("match", *_ERRORS))
     write_tum(folder / "trajectory.tum", m.t_s, m.poses)
-    sigma = report.get("calibration", {}).get("sigma") or report.get("camera_sigma", {})
-    write_camera(folder / "camera.yaml", m.camera, how_calibrated, sigma_residuals(m.camera, sigma))
+    sigma = sigma_residuals(m.camera, sigma_in_report(report))
+    write_camera(folder / "camera.yaml", m.camera, how_calibrated, sigma)
     lines = [
         {
             "segment": segment,
