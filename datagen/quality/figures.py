@@ -18,6 +18,7 @@ from datagen.slam.loops.pose_graph import revisit_residuals
 from lanenet.data.maps.folder import DriveMap
 from lanenet.data.maps.line import LaneLine
 from lanenet.data.maps.mapped_drive import NOT_MAPPED, MappedDrive
+from lanenet.errors import counted
 from lanenet.geometry.frames import map_from_car, map_from_car_directions
 
 
@@ -120,6 +121,7 @@ def map_evidence(
         ("none of its parts has most of the frames", 2 * frames[largest] <= frames.sum()),
         ("places do not tell how long a lap is", calibration.get("alike", False)),
         ("nothing certainly closes the lap", not segments[largest]["closed"]),
+        (f"{counted(loose, 'frame')} joined at one end, or not at all", loose > 0),
     )
     return MapEvidence(
         labels=quality.labels,
@@ -148,7 +150,7 @@ def map_evidence(
         ahead_cm=drive_map.camera.mounting.ahead_of_front_axle_cm,
         tape_range_cm=tape_range_cm([line for lines in drive_map.lines.values() for line in lines]),
         steering=figures["steering_correlation"],
-        elsewhere=int(frames.sum() - frames.max()) + quality.status.count(NOT_MAPPED) + loose,
+        elsewhere=int(frames.sum() - frames.max()) + quality.status.count(NOT_MAPPED),
         speed_cm_s=float(np.median(np.hypot(*steps_cm[:, :2].T)) / np.median(np.diff(drive_map.t_s))),
         pauses=figures.get("pauses", 0),
     )

@@ -87,8 +87,7 @@ class MapEvidence:
             odometry from the closed loops, in sigmas.
         missed: The part of the strain that is heading which odometry misses in a lap.
         turn_open: Whether places were seen twice, but do not tell how far a lap turns.
-        elsewhere: Frames outside the largest segment, which are not joined to it, and those of it that
-            revisits hold at one end alone.
+        elsewhere: Frames outside the largest segment, which are not joined to it.
         speed_cm_s: Median speed of the car.
         pauses: How often the recording pauses, if it does so again and again.
         wrong_share: Share of the lines' length in sections that the images contradict.
@@ -360,10 +359,8 @@ def map_state(e: MapEvidence, s: VerdictSettings) -> tuple[MapState, str]:
         return "wrong in sections", f" without labels, the longest {e.wrong[0]}" if e.wrong else ""
     if not e.revisits or e.turn_open:
         return "open", f": {_TURN_OPEN if e.turn_open else 'no loop was certainly closed'}"
-    apart = (
-        f", but for {counted(e.elsewhere, 'frame')} joined at one end or not at all" if e.elsewhere else ""
-    )
-    return ("open", f": {e.open_for}") if e.open_for else ("closed", apart)
+    apart = f", but for {counted(e.elsewhere, 'frame')} that {'is' if e.elsewhere == 1 else 'are'} not on it"
+    return ("open", f": {e.open_for}") if e.open_for else ("closed", apart if e.elsewhere else "")
 
 
 def checks(e: MapEvidence, s: VerdictSettings) -> Iterator[Check]:
