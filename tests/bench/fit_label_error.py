@@ -1,6 +1,7 @@
 """Fit the model of label errors to tables of ``label_tables.py``: ``make fit-labels``.
 
 With ``--check`` nothing is fitted: the errors that the tables' maps foretell are compared with the true ones.
+With ``--calibrate`` the trees stay, and the logits are fitted to drives that the trees never saw.
 
 Drives are left out in turn (five folds by drive), for the calibration and for the figures that are printed:
 log loss, expected and observed shares by bins of the predicted probability with intervals by bootstrap over
@@ -40,8 +41,8 @@ TRIED = (
     (0.3, 0.01),
     (0.2, 0.01),
 )
-#: Errors below this are alike, [cm].
-LEAST_CM = 0.05
+#: Errors below this are alike, [cm], and probabilities: a map stores four decimals.
+LEAST_CM, LEAST_SHARE = 0.05, 5e-5
 
 
 def read(folders: list[Path]) -> dict[str, np.ndarray]:
@@ -174,16 +175,39 @@ def check(table: dict[str, np.ndarray]) -> str:
     return said + kinds_text(table["off_1"], table["off_3"], table)
 
 
+def calibrated(path: Path, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a stored model with the slopes and intercepts of its logits fitted to what the maps foretold."""
+    with np.load(path) as model:
+        columns = dict(model)
+    for name, bound_cm in zip(("off_1", "off_3"), BOUNDS_CM, strict=True):
+        known = np.isfinite(table[name]) & ~table["spoilt"]
+        share = np.clip(table[name][known].astype(np.float64), LEAST_SHARE, 1.0 - LEAST_SHARE)
+        logit, wrong = np.log(share / (1.0 - share)), np.abs(table["error_cm"][known]) > bound_cm
+        line, drive, out = LogisticRegression(C=1e6), table["drive"][known], np.zeros(len(share))
+        for train, test in GroupKFold(FOLDS).split(logit, groups=drive):
+            out[test] = line.fit(logit[train, None], wrong[train]).predict_proba(logit[test, None])[:, 1]
+        slope, intercept = float(line.fit(logit[:, None], wrong).coef_[0, 0]), float(line.intercept_[0])
+        columns[f"{name}_scale"] = slope * columns[f"{name}_scale"] + np.array([0.0, intercept])
+        sys.stdout.write(f"{name}: slope {slope:.3f}, {intercept:+.3f}\n{bins_text(out, wrong, drive)}\n")
+    return columns
+
+
 def main() -> None:
     """Fit, print, and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="+", help="of label_tables.py")
     parser.add_argument("--out", type=Path, help="file of the model; nothing is written without it")
     parser.add_argument("--check", action="store_true", help="compare what maps foretell; fit nothing")
+    parser.add_argument("--calibrate", type=Path, help="the model by which the maps were made")
     args = parser.parse_args()
     table = read(args.folders)
     if args.check:
         sys.stdout.write(check(table))
+        return
+    if args.calibrate is not None:
+        columns = calibrated(args.calibrate, table)
+        if args.out is not None:
+            np.savez_compressed(args.out, allow_pickle=False, **columns)
         return
     names, features, size = table["names"].tolist(), table["features"], np.abs(table["error_cm"])
     drives, columns, found = table["drive"], {"names": np.array(names)}, {}
