@@ -121,7 +121,7 @@ def map_evidence(
         ("none of its parts has most of the frames", 2 * frames[largest] <= frames.sum()),
         ("places do not tell how long a lap is", calibration.get("alike", False)),
         ("nothing certainly closes the lap", not segments[largest]["closed"]),
-        (f"{counted(loose, 'frame')} joined at one end, or not at all", loose > 0),
+        (f"{counted(loose, 'frame')} joined at one end, or not at all", loose > 0.01 * frames[largest]),
     )
     return MapEvidence(
         labels=quality.labels,
