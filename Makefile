@@ -10,7 +10,7 @@ PIP_ARGS ?=
 
 BIN := $(VENV)/bin
 # Built by pip where there is a C++ compiler.
-KERNELS := $(wildcard lanenet/perception/*.hpp lanenet/perception/_kernels.cpp lanenet/perception/*/_kernels.cpp)
+KERNELS := $(wildcard lanenet/perception/*.hpp lanenet/perception/*/_kernels.cpp)
 PIP := $(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt
 # Tests run on this many cores. Each process takes over a gigabyte, hence the bound for large machines.
 TEST_PROCESSES ?= auto
@@ -23,7 +23,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
   --jaxtyping-packages=lanenet,datagen,beartype.beartype -rs --fail-on-skips all \
   --numprocesses $(TEST_PROCESSES) --maxprocesses 4 --dist worksteal
 
-.PHONY: help train general install env test test-data test-slow test-base-install chain traps ablation fit-labels left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
+.PHONY: help train general install env test test-data test-slow test-base-install chain traps ablation fit-lane fit-labels left-out leaderboard judge screenshots fleet golden golden-renew donkeycar arm release pictures wheels neutral faults check format format-check lint types imports docs figures links bench clean
 
 help:
 	@echo "make train        environment, then a network from nothing by $(CONFIG), into checkpoints/$(NAME)/"
@@ -34,7 +34,8 @@ help:
 	@echo "make test-slow    the tests that take long, and further cases of fast ones"
 	@echo "make test-base-install  the wheel and the source archive in empty environments, with every Python there is"
 	@echo "make chain        from simulate to detect by the command line, kills in between; two steps of all but one config; two processes"
-	@echo "make ablation     what parts of the network's tracker are worth, on 500 simulated drives (goes on where it stopped)"
+	@echo "make ablation     what parts of the lane filter are worth, on 500 simulated drives (goes on where it stopped)"
+	@echo "make fit-lane     the numbers of the lane filter, from simulated drives with their truth (goes on where it stopped)"
 	@echo "make traps        maps of drives that are hard to map, of one KIND (goes on where it stopped), and broken maps"
 	@echo "make fit-labels   the model of label errors, from drives of four kinds with their truth; hours"
 	@echo "make left-out     the general network on each real drive, without it and tuned to it (goes on where it stopped)"
@@ -112,6 +113,10 @@ traps: $(VENV)/.stamp-dev
 # 500 drives take 20 minutes on one core; goes on where it stopped. ABLATION adds arguments, such as --processes 2.
 ablation: $(VENV)/.stamp-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/bench_ablation.py --folder runs/ablation $(ABLATION)
+
+# Half an hour on one core; goes on where it stopped. FIT adds arguments, such as --drives 100.
+fit-lane: $(VENV)/.stamp-dev
+	OMP_NUM_THREADS=1 $(BIN)/python tests/bench/fit_lane.py --folder runs/fit-lane $(FIT)
 
 # Goes on where it stopped; FIT_KINDS and TRAPS narrow it.
 FIT_KINDS ?= roads tiles office mats
@@ -221,6 +226,7 @@ docs: $(VENV)/.stamp-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 figures: $(VENV)/.stamp-dev
+	$(BIN)/python tests/bench/draw_hypotheses.py docs/images/hypotheses.png
 	$(BIN)/python contrib/docs/figures.py docs/images/frames
 	for paper in a4 letter; do $(BIN)/lanenet calibrate print --paper $$paper --out docs/print/board-$$paper.pdf; done
 

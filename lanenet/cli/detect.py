@@ -345,7 +345,7 @@ def _watch(
         estimate, i = found.estimates[ONE], found.index
         lane = lane_of(estimate, getattr(detector, "last", None) if found.image is not None else None)
         frame, t_s = int(source.frames[i]), float(source.t_s[i])
-        seen = Seen(frame, t_s, found.image, {"detected": lane}, values_of(estimate))
+        seen = Seen(frame, t_s, found.image, {"detected": lane}, values_of(estimate), reason=estimate.reason)
         if mapped is not None:
             seen = mapped.add_to(seen)
             if "reference" in seen.lanes:

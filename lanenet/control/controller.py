@@ -11,7 +11,7 @@ from pydantic import Field
 from lanenet.config import Rule, Settings
 from lanenet.control.plausibility import JumpCheck, fault_of, misfit_of
 from lanenet.control.smoothing import LaneSmoother, SmoothingSettings
-from lanenet.control.steering import SteeringSettings, corner_target_rad, steering_target_rad
+from lanenet.control.steering import SteeringSettings, steering_target_rad
 from lanenet.geometry.lane import parabola_through
 from lanenet.perception.estimate import Detector, LaneEstimate, LaneMemory, TakesMotion
 
@@ -214,8 +214,6 @@ class LaneController:
         if self._settings.own_target:
             limit, target = self._steering.max_steering_rad, estimate.steering_rad
             return min(max(target, -limit), limit) if math.isfinite(target) else math.nan
-        if estimate.centre_line_cm is not None:
-            return corner_target_rad(estimate.centre_line_cm, self._steering, self._memory.width_cm)
         # Smoothing may hold one line, but a frame without any line has no target.
         if not any(map(math.isfinite, estimate.points_cm.tolist())):
             return math.nan

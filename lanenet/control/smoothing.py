@@ -102,6 +102,7 @@ class LaneSmoother:
             offset_cm=estimate.offset_cm,
             presence=estimate.presence,
             own_lane=estimate.own_lane,
+            reason=estimate.reason,
             lines_px=estimate.lines_px,
         )
 

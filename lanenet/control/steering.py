@@ -19,13 +19,6 @@ from lanenet.geometry.lane import (
 )
 from lanenet.perception.estimate import LaneEstimate
 
-#: So far from the lane's centre, as a share of its width, a car cuts a corner at most. Tried: on 28 simulated
-#: roads with corners 0.08, 0.15 and 0.25 gave 10, 8 and 9 without a departure, and 3, 5 and 6 departures on
-#: one of them, whose lane is 33 cm wide.
-_MOST_ASIDE = 0.15
-#: Steps along each piece of the way around a corner, of 1 cm at most; and how far ahead the aim is at least.
-_SHARES, _LEAST_AHEAD_CM = np.linspace(0.0, 1.0, 91), 1e-6
-
 
 class SteeringSettings(Settings):
     """How the lane's centre becomes a steering angle.
@@ -65,48 +58,6 @@ def steering_target_rad(
     if not math.isfinite(centre_cm):
         return float("nan")
     return _angle_to_rad(centre_cm, settings.look_ahead_cm, settings)
-
-
-def corner_target_rad(
-    centre_line_cm: Float[np.ndarray, "3 2"], settings: SteeringSettings, lane_width_cm: float | None = None
-) -> float:
-    """Return the front-wheel angle that leads around a corner of the lane.
-
-    The car aims at the look-ahead distance on the centre line, where that is rounded off by the tightest bend
-    that the front axle can follow, as far as the lane is wide enough for it.
-
-    Args:
-        centre_line_cm: The lane's centre before, at and beyond its corner, frame car.
-        settings: Law, look-ahead, wheelbase and limit.
-        lane_width_cm: Distance between the lines; replaces that of the settings.
-
-    Returns:
-        Steering angle, [rad], positive left, within the limit.
-
-    Source:
-        Own derivation: an arc of radius R passes a corner of angle t at R (1 / cos(t / 2) - 1) on its inner
-        side, and begins R tan(t / 2) before it. What is driven is a parabola with its tangents, which turns
-        more in the middle and cuts less.
-    """
-    first_cm, corner_cm, last_cm = np.asarray(centre_line_cm, np.float64)
-    legs_cm = math.dist(first_cm, corner_cm), math.dist(corner_cm, last_cm)
-    there, on = (corner_cm - first_cm) / legs_cm[0], (last_cm - corner_cm) / legs_cm[1]
-    half_rad = 0.5 * math.acos(min(1.0, max(-1.0, float(there @ on))))
-    aside = 1.0 / math.cos(half_rad) - 1.0
-    radius_cm = settings.wheelbase_cm / math.sin(settings.max_steering_rad)
-    width_cm = settings.lane_width_cm if lane_width_cm is None else lane_width_cm
-    if width_cm is not None and radius_cm * aside > _MOST_ASIDE * width_cm:
-        radius_cm = _MOST_ASIDE * width_cm / aside
-    cut_cm = min(radius_cm * math.tan(half_rad), *legs_cm)
-    # A parabola with the tangents of the arc.
-    t = _SHARES[:, None]
-    arc_cm = corner_cm + cut_cm * (t * t * on - (1.0 - t) ** 2 * there)
-    begin_cm, end_cm = arc_cm[0], arc_cm[-1]
-    path_cm = np.concatenate([first_cm + t * (begin_cm - first_cm), arc_cm, end_cm + t * (last_cm - end_cm)])
-    away_cm = np.hypot(path_cm[:, 0], path_cm[:, 1])
-    reached = np.flatnonzero(away_cm <= settings.look_ahead_cm)
-    x, y = path_cm[reached[-1] if len(reached) else int(away_cm.argmin())].tolist()
-    return _angle_to_rad(x, max(y, _LEAST_AHEAD_CM), settings)
 
 
 def _angle_to_rad(right_cm: float, ahead_cm: float, settings: SteeringSettings) -> float:

@@ -21,6 +21,8 @@ SIGMA_NAMES: tuple[str, ...] = tuple(f"{name.removesuffix('_cm')}_sigma_cm" for 
 PARABOLA_NAMES: tuple[str, ...] = tuple(f"{side}_{letter}" for side in SIDES for letter in "abc")
 #: Written only by detectors that measure them.
 LANE_NAMES: tuple[str, ...] = ("radius_cm", "offset_cm", "own_lane")
+#: Why points of a frame, or all, are not answered; written only by detectors that say so.
+REASON_NAME = "reason"
 #: Written only by detectors that work on lines of the image, then in every row; empty for a missing line.
 IMAGE_LINE_NAMES: tuple[str, ...] = tuple(f"{side}_{name}" for side in SIDES for name in LINE_PX_NAMES)
 #: Columns with empty cells where a detector does not know the value.
@@ -35,6 +37,7 @@ class DetectionTable:
     def __init__(self) -> None:
         self._frames: list[int] = []
         self._rows: list[np.ndarray] = []
+        self._reasons: list[str] = []
         self._has_image_lines = False
 
     def __len__(self) -> int:
@@ -43,6 +46,7 @@ class DetectionTable:
     def add(self, frame: int, t_s: float, estimate: LaneEstimate) -> None:
         """Append the estimate of one frame; ``t_s`` is NaN if there is no time."""
         self._frames.append(int(frame))
+        self._reasons.append(estimate.reason)
         lines_px = estimate.lines_px
         self._has_image_lines |= lines_px is not None
         self._rows.append(
@@ -83,10 +87,11 @@ class DetectionTable:
         unknown += [] if self._has_image_lines else IMAGE_LINE_NAMES
         columns = {name: values for name, values in columns.items() if name not in unknown}
         frame = np.array(self._frames, dtype=np.int64)
+        reasons = {REASON_NAME: self._reasons} if any(self._reasons) else {}
         if ending == ".csv":
             write_csv(
                 path,
-                {"frame": frame, **columns, VERSION_NAME: np.full(len(frame), FORMAT_VERSION)},
+                {"frame": frame, **columns, **reasons, VERSION_NAME: np.full(len(frame), FORMAT_VERSION)},
                 allow_empty=(*_OPEN_COLUMNS, *LANE_NAMES, *IMAGE_LINE_NAMES),
                 allow_infinite=_INFINITE_COLUMNS,
             )
@@ -94,6 +99,7 @@ class DetectionTable:
         arrow = require("pyarrow", "data")
         arrays: dict[str, Any] = {"frame": arrow.array(frame)}
         arrays |= {name: float_array(values) for name, values in columns.items()}
+        arrays |= {name: arrow.array(texts) for name, texts in reasons.items()}
         units = {
             "_cm": "centimetre",
             "_rad": "radian",

@@ -57,6 +57,7 @@ def draw_estimate(
     if image_lane is not None:
         _draw_image_lane(image, image_lane, scale, 2 * thickness)
         caption = f"{caption}  {image_lane.text}".strip()
+    caption = f"{caption}  {estimate.reason}".strip()
     if camera is not None:
         if truth_cm is not None:
             _draw_road(image, LaneEstimate(truth_cm), camera, scale, thickness, (TRUTH_BGR, TRUTH_BGR))

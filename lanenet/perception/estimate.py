@@ -36,8 +36,8 @@ class LaneEstimate:
             know it.
         own_lane: Probability that it is the lane to drive in, not the next one; NaN where the detector does
             not know it.
-        centre_line_cm: The lane's centre before, at and beyond a corner that is too sharp for parabolas,
-            [cm], frame car; None elsewhere.
+        reason: Why a point, or the whole frame, is not answered; empty where all are, or from a detector that
+            does not say.
         lines_px: Left and right line in the image, the numbers of
             :data:`lanenet.perception.image_lane.LINE_PX_NAMES`; NaN for a missing line, None from a detector
             that does not work on lines of the image.
@@ -51,7 +51,7 @@ class LaneEstimate:
     offset_cm: float = float("nan")
     presence: Float[np.ndarray, "2"] = field(default_factory=lambda: np.full(len(SIDES), np.nan))
     own_lane: float = float("nan")
-    centre_line_cm: Float[np.ndarray, "3 2"] | None = None
+    reason: str = ""
     lines_px: Float[np.ndarray, "2 8"] | None = None
 
     @property
@@ -245,13 +245,6 @@ class LaneMemory:
             "the lane on a straight, between the middles of its two lines, or the camera file is of another "
             "car"
         )
-
-    def match(self, widths_cm: Float[np.ndarray, "*shape"], sigma: float) -> Float[np.ndarray, "*shape"]:
-        """Rate widths from 0 to 1, the likeliest; ``sigma`` is that of the logarithm along the lane."""
-        if self.given_cm is None:
-            return self.belief.match(widths_cm, sigma)
-        off = np.log(widths_cm / self.given_cm) / sigma
-        return np.exp(-0.5 * off * off)
 
     def learn(self, points_cm: Float[np.ndarray, "6"], presence: Float[np.ndarray, "2"]) -> None:
         """Learn the width of a frame in which both lines are certain; other frames are ignored.

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-
-from lanenet.perception.edges.compiled import loops_of
-
-_kernels: Any = loops_of("lanenet.perception")
 
 #: Logarithms of the widths that are told apart, [cm]: 8 to 200 cm in steps of 2.5 %.
 _STEP = 0.025
@@ -22,8 +15,7 @@ _QUANTILE = 1.645
 #: Least sigma of the prior. Chosen: a network that was trained on one width may be used on another.
 _LEAST_PRIOR = 0.3
 #: Sigma of a frame's width, as a share of it; share of frames that show lines of other lanes; and frames that
-#: count as one, since neighbours share their errors. Chosen; 0.4 and 8 gave no smaller
-#: RMSE on 31 simulated drives, while pairs counted from 9 cm.
+#: count as one, since neighbours share their errors. Chosen.
 _FRAME_SIGMA, _OTHERS, _ALIKE = 0.06, 0.15, 4.0
 #: Frames that are remembered. 100, 300 and 1000 were tried and hardly differ: 15 s at 20 frames/s.
 _LENGTH = 300.0
@@ -73,65 +65,19 @@ class WidthBelief:
 
     def learn(self, width_cm: float) -> None:
         """Take in the distance of the two lines of a frame, [cm], positive."""
-        log_width = math.log(width_cm)
-        if _kernels is not None:
-            belief = self._nats, self._prior, _LOG_CM, self._probability
-            self._say(*_kernels.learn(*belief, log_width, _FRAME_SIGMA, _OWN, _FLOOR, _KEPT, _ALIKE))
-            return
-        off = (_LOG_CM - log_width) / _FRAME_SIGMA
-        likely = _each(math.log, _OWN * _each(math.exp, -0.5 * (off * off)) + _FLOOR)
+        off = (_LOG_CM - math.log(width_cm)) / _FRAME_SIGMA
+        likely = np.log(_OWN * np.exp(-0.5 * off * off) + _FLOOR)
         told = _KEPT * (self._nats - self._prior) + likely / _ALIKE
         self._set(self._prior + told)
 
     def _set(self, nats: Float[np.ndarray, "n"]) -> None:
         self._nats = nats - nats.max()
-        probability = _each(math.exp, self._nats)
-        self._probability = probability / _sum(probability)
-        mean = float(_sum(self._probability * _LOG_CM))
-        self._say(mean, float(_sum(self._probability * ((_LOG_CM - mean) * (_LOG_CM - mean)))))
-
-    def _say(self, mean: float, variance: float) -> None:
-        self.mean_cm, self.sigma = math.exp(mean), math.sqrt(variance)
+        probability = np.exp(self._nats)
+        probability /= probability.sum()
+        mean = float(probability @ _LOG_CM)
+        self.mean_cm, self.sigma = math.exp(mean), math.sqrt(float(probability @ (_LOG_CM - mean) ** 2))
 
     @property
     def width_cm(self) -> float | None:
         """The width; None while too many are possible."""
         return self.mean_cm if self.sigma < _KNOWN else None
-
-    def match(self, widths_cm: Float[np.ndarray, "*shape"], sigma: float) -> Float[np.ndarray, "*shape"]:
-        """Rate widths by the belief, from 0 to 1 for the likeliest.
-
-        Args:
-            widths_cm: Positive.
-            sigma: Standard deviation by which the logarithm of a lane's width varies along it.
-        """
-        kernel = _kernel(sigma)
-        if _kernels is not None:
-            rates = _kernels.match(self._probability, kernel, _LOG_CM, np.ascontiguousarray(widths_cm), _STEP)
-            return np.frombuffer(rates).reshape(widths_cm.shape)
-        shifted = np.lib.stride_tricks.sliding_window_view(kernel, len(_LOG_CM))[::-1]
-        density = _sum(shifted * self._probability[:, None])
-        log_widths = _each(math.log, widths_cm.reshape(-1))
-        # Written so that NaN gives the first.
-        log_widths = np.where(log_widths > _LOG_CM[0], np.minimum(log_widths, _LOG_CM[-1]), _LOG_CM[0])
-        below = np.minimum(((log_widths - _LOG_CM[0]) / _STEP).astype(np.int64), len(_LOG_CM) - 2)
-        share = (log_widths - _LOG_CM[below]) / (_LOG_CM[below + 1] - _LOG_CM[below])
-        rates = density[below] + (density[below + 1] - density[below]) * share
-        return (rates / density.max()).reshape(widths_cm.shape)
-
-
-@functools.lru_cache(maxsize=4)
-def _kernel(sigma: float) -> Float[np.ndarray, "k"]:
-    """How likely a width is elsewhere along the lane, by the steps of the grid, from below to above."""
-    off = _STEP * np.arange(1 - len(_LOG_CM), len(_LOG_CM)) / sigma
-    return np.exp(-0.5 * off * off)
-
-
-def _each(function: Callable[[float], float], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Apply a function of the C library, which the compiled loops share; NumPy has its own."""
-    return np.array([function(value) for value in values.tolist()])
-
-
-def _sum(terms: Float[np.ndarray, "n *shape"]) -> Float[np.ndarray, "*shape"]:
-    """Return the sum from first to last, without the partial sums of ``numpy.sum``."""
-    return np.asarray(np.add.accumulate(terms, axis=0)[-1])

@@ -104,6 +104,8 @@ class RerunViewer:
             edges_px = self._artist.birdseye_px(drawing.edges_cm)
             self._log("birdseye/edges", rr.Points2D(edges_px, radii=_DOT, colors=_rgb(ARROW_BGR)))
         self._add_lanes(drawing)
+        if seen.reason:
+            self._log("unanswered", rr.TextLog(seen.reason))
         for name, value in drawing.values.items():
             is_angle = name.endswith(_ANGLE)
             shown = f"{name.removesuffix(_ANGLE)}_deg" if is_angle else name

@@ -93,6 +93,7 @@ class Seen:
         values: Numbers for plots, by names that end in their units where they have one; NaN is left out.
         pose: Rear axle and heading, [cm], [cm], [rad], frame map; None if unknown.
         camera: The camera with this frame's tilt; None takes the scene's.
+        reason: Why a point, or the whole frame, is not answered; empty where all are.
     """
 
     frame: int
@@ -102,6 +103,7 @@ class Seen:
     values: Mapping[str, float] = field(default_factory=dict)
     pose: Float[np.ndarray, "3"] | None = None
     camera: Camera | None = None
+    reason: str = ""
 
 
 def lane_of(estimate: LaneEstimate, image_lane: ImageLane | None = None) -> Lane:

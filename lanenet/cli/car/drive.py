@@ -100,6 +100,15 @@ def _show(views: Views, stack: ExitStack, settings: DriveSettings) -> Show:
 
     def show(frame: Frame, estimate: LaneEstimate, step: Step) -> None:
         values = {"sent_steering_rad": step.steering_rad, "throttle": step.throttle, **values_of(estimate)}
-        recording.add(Seen(frame.number, frame.t_s, frame.image_bgr, {"detected": lane_of(estimate)}, values))
+        recording.add(
+            Seen(
+                frame.number,
+                frame.t_s,
+                frame.image_bgr,
+                {"detected": lane_of(estimate)},
+                values,
+                reason=estimate.reason,
+            )
+        )
 
     return show

@@ -1,7 +1,6 @@
-// Lines on the edge points of their markings, their corners and distances: refinement.py, corner.py and
-// tracking/pair.py, compiled. What a step means and where its numbers come from stands there. Every sum is taken in the
-// order of the Python code, in double precision, so that the bytes are equal (build with -ffp-contract=off). Arrays
-// come as contiguous buffers, whose types compiled.py sees to.
+// Lines on the edge points of their markings: refinement.py, compiled. What a step means and where its numbers come from
+// stands there. Every sum is taken in the order of the Python code, in double precision, so that the bytes are equal
+// (build with -ffp-contract=off). Arrays come as contiguous buffers, whose types compiled.py sees to.
 
 #include "../arguments.hpp"
 
@@ -31,7 +30,7 @@ namespace {
 
 constexpr int kRows = 3, kNodes = 8, kSteps = 2, kPlaces = 4;  // label rows, nodes, steps, bins beside a row
 constexpr int kMost = 128, kMostBins = 64;                     // edge points of a line, bins along it
-constexpr int kAsked = 10, kPerLine = 15, kPerCorner = 3;      // numbers of a line, before and after
+constexpr int kAsked = 10, kPerLine = 15;                     // numbers of a line, before and after
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
 // The settings, as _NUMBERS of refinement.py has them.
@@ -463,211 +462,6 @@ WIDE void refine_line(const Numbers& s, const double* points, const double* sigm
   look[2] = 1.0 - static_cast<double>(filled) / (last - first);
 }
 
-// distances_cm() of two lines given at n places.
-WIDE double distance_of(const double* left, const double* right, const double* y, int n, int begin, int end,
-                        double* __restrict nearest) {
-  const int between = end - begin, count = 2 * between;
-  for (int side = 0; side < 2; ++side) {
-    const double *own = (side ? right : left) + begin, *other = side ? left : right, *place = y + begin;
-    double* least = nearest + side * between;
-    std::fill_n(least, between, std::numeric_limits<double>::infinity());
-    for (int j = 0; j < n; ++j)
-      for (int i = 0; i < between; ++i) {
-        const double across = other[j] - own[i], ahead = y[j] - place[i];
-        const double square = across * across + ahead * ahead;
-        least[i] = square < least[i] ? square : least[i];
-      }
-  }
-  double* middle = nearest + count / 2;
-  std::nth_element(nearest, middle, nearest + count);
-  const double upper = *middle, lower = *std::max_element(nearest, middle);
-  return std::sqrt((lower + upper) / 2.0);
-}
-
-// What stands in corner.py.
-struct CornerNumbers {
-  double basis[kRows][3];
-  double near_cm, far_cm, farthest_cm, own_cm, own_cosine, aside_cm, aside_cosine, meet_cm, opposite;
-  double next_cm, least, span_cm, beyond_cm, goes_on;
-};
-
-// An edge point, moved to the middle of its tape: its place and normal, the distance from the line to its right, and
-// the cosine of the two directions.
-struct Middle {
-  double x, y, normal_x, normal_y, off, along;
-};
-
-// Those near a line, sorted into cells as wide as tape may have gaps: what is next to a point lies in the cells around
-// its own.
-struct Middles {
-  std::vector<Middle> found;
-  std::vector<double> x, y, normal_x, normal_y;
-  std::vector<std::int64_t> own;   // as wide as what is compared, so that four are at a time
-  std::vector<int> cell, begin;    // of each point its cell, and of each cell its first point
-  std::vector<int> place, stack;   // of each as found its place here; of those here the ones to look at
-  std::vector<std::int8_t> reached, of_tape;
-  int columns, count;
-};
-
-constexpr double kMostColumns = 1000.0;  // of cells; what is further to the side shares the last one
-
-inline bool is_own(const CornerNumbers& s, const Middle& e) {
-  return std::abs(e.off) < s.own_cm && e.along > s.own_cosine;
-}
-inline bool is_aside(const CornerNumbers& s, const Middle& e) {
-  return std::abs(e.off) > s.aside_cm && e.along < s.aside_cosine;
-}
-
-// Moves the edge points near a line to the middle of their tape; whether there may be a corner.
-template <class T>
-bool take_middles(const CornerNumbers& s, const double* line, const T* points, const T* normals, size_t n,
-                  Middles& out) {
-  out.found.resize(n);
-  const Parabola curve = parabola_of(&s.basis[0][0], line);
-  const double half = 0.5 * line[kRows], a2 = 2.0 * curve.a, farthest2 = s.farthest_cm * s.farthest_cm;
-  int count = 0, own = 0, aside = 0;
-  for (size_t i = 0; i < n; ++i) {
-    Middle e;
-    e.normal_x = normals[2 * i], e.normal_y = normals[2 * i + 1];
-    e.x = points[2 * i] + e.normal_x * half, e.y = points[2 * i + 1] + e.normal_y * half;
-    if (!(e.y > s.near_cm && e.y < s.far_cm)) continue;
-    const double slope = a2 * e.y + curve.b, steep = 1.0 + slope * slope;
-    const double off = e.x - ((curve.a * e.y + curve.b) * e.y + curve.c);
-    if (!(off * off < farthest2 * steep)) continue;
-    const double across = 1.0 / std::sqrt(steep);
-    e.off = off * across;
-    e.along = std::abs(e.normal_x - e.normal_y * slope) * across;
-    own += is_own(s, e);
-    aside += is_aside(s, e);
-    out.found[count++] = e;
-  }
-  out.count = count;
-  return own >= s.least && aside >= s.least;
-}
-
-void sort_into_cells(const CornerNumbers& s, Middles& e) {
-  const int n = e.count;
-  const double cell_cm = 1.001 * s.next_cm;  // more than tape may have as a gap, whatever is rounded
-  double first_x = e.found[0].x, last_x = first_x;
-  for (int i = 1; i < n; ++i) first_x = std::min(first_x, e.found[i].x), last_x = std::max(last_x, e.found[i].x);
-  const auto column_of = [&](double x) {
-    return static_cast<int>(std::min((x - first_x) / cell_cm, kMostColumns)) + 1;
-  };
-  // One more around all of them, so that each cell has its neighbours.
-  e.columns = column_of(last_x) + 2;
-  const int rows = static_cast<int>((s.far_cm - s.near_cm) / cell_cm) + 3;
-  for (auto* values : {&e.x, &e.y, &e.normal_x, &e.normal_y}) values->resize(n);
-  for (auto* flags : {&e.reached, &e.of_tape}) flags->resize(n);
-  e.own.resize(n), e.cell.resize(n), e.place.resize(n);
-  e.begin.assign(e.columns * rows + 1, 0);
-  const auto cell_of = [&](const Middle& point) {
-    return (static_cast<int>((point.y - s.near_cm) / cell_cm) + 1) * e.columns + column_of(point.x);
-  };
-  for (int i = 0; i < n; ++i) ++e.begin[e.place[i] = cell_of(e.found[i])];
-  int before = 0;
-  for (int& begin : e.begin) before += begin, begin = before;
-  for (int i = n - 1; i >= 0; --i) {
-    const Middle& point = e.found[i];
-    const int cell = e.place[i], k = e.place[i] = --e.begin[cell];
-    e.cell[k] = cell;
-    e.x[k] = point.x, e.y[k] = point.y, e.normal_x[k] = point.normal_x, e.normal_y[k] = point.normal_y;
-    e.own[k] = is_own(s, point);
-    e.reached[k] = 0, e.of_tape[k] = -1;  // not looked at
-  }
-}
-
-inline double apart2(const Middles& e, int i, int j) {
-  const double x = e.x[j] - e.x[i], y = e.y[j] - e.y[i];
-  return x * x + y * y;
-}
-
-// Whether the other border of its tape is where a point is.
-WIDE bool meets(const CornerNumbers& s, const Middles& e, int i) {
-  const double most2 = s.meet_cm * s.meet_cm;
-  std::int64_t any = 0;
-  for (int row = -1; row <= 1; ++row) {
-    const int middle = e.cell[i] + row * e.columns, last = e.begin[middle + 2];
-    for (int j = e.begin[middle - 1]; j < last; ++j)
-      any |= (apart2(e, i, j) < most2) & (e.normal_x[j] * e.normal_x[i] + e.normal_y[j] * e.normal_y[i] < s.opposite);
-  }
-  return any;
-}
-
-// Whether a point of the line itself is next to one.
-WIDE bool is_beside_own(const CornerNumbers& s, const Middles& e, int i) {
-  const double most2 = s.next_cm * s.next_cm;
-  std::int64_t any = 0;
-  for (int row = -1; row <= 1; ++row) {
-    const int middle = e.cell[i] + row * e.columns, last = e.begin[middle + 2];
-    for (int j = e.begin[middle - 1]; j < last; ++j) any |= e.own[j] & (apart2(e, i, j) < most2);
-  }
-  return any;
-}
-
-// _corner() of one line, whose edge points are in `e`.
-void find_corner(const CornerNumbers& s, Middles& e, double* out) {
-  const int n = e.count;
-  sort_into_cells(s, e);
-  const auto is_of_tape = [&](int i) {
-    if (e.of_tape[i] < 0) e.of_tape[i] = meets(s, e, i);
-    return e.of_tape[i] > 0;
-  };
-  const auto reach = [&](int i) {
-    if (!is_of_tape(i)) return;
-    e.reached[i] = 1;
-    e.stack.push_back(i);
-  };
-  e.stack.clear();
-  for (int i = 0; i < n; ++i) {
-    const int k = e.place[i];
-    if (!e.own[k] && std::abs(e.found[i].off) < s.own_cm + s.next_cm && is_beside_own(s, e, k)) reach(k);
-  }
-  const double next2 = s.next_cm * s.next_cm;
-  while (!e.stack.empty()) {
-    const int i = e.stack.back();
-    e.stack.pop_back();
-    for (int row = -1; row <= 1; ++row) {
-      const int middle = e.cell[i] + row * e.columns;
-      for (int j = e.begin[middle - 1]; j < e.begin[middle + 2]; ++j)
-        if (!e.reached[j] && !e.own[j] && apart2(e, i, j) < next2) reach(j);
-    }
-  }
-  int count = 0;
-  double off = 0.0, along = 0.0, far = 0.0;
-  Middle least = e.found[0], most = e.found[0];
-  for (int i = 0; i < n; ++i) {
-    const Middle& point = e.found[i];
-    if (!e.reached[e.place[i]] || !is_aside(s, point)) continue;
-    if (!count) least = most = point;
-    least.x = std::min(least.x, point.x), most.x = std::max(most.x, point.x);
-    least.y = std::min(least.y, point.y), most.y = std::max(most.y, point.y);
-    off += point.off;
-    along += point.along;
-    far += point.y;
-    ++count;
-    e.stack.push_back(e.place[i]);
-  }
-  const double span_x = most.x - least.x, span_y = most.y - least.y;
-  if (count < s.least || span_x * span_x + span_y * span_y < s.span_cm * s.span_cm) return;
-  double nearest2 = std::numeric_limits<double>::infinity(), ahead = 0.0;
-  for (int i = 0; i < n; ++i) {
-    const int k = e.place[i];
-    for (size_t j = 0; e.own[k] && j < e.stack.size(); ++j) {
-      const double there2 = apart2(e, k, e.stack[j]);
-      if (!(there2 < nearest2)) continue;
-      nearest2 = there2;
-      ahead = e.y[k];
-    }
-  }
-  int beyond = 0;
-  for (int k = 0; k < n; ++k) beyond += e.own[k] && e.y[k] > ahead + s.beyond_cm && is_of_tape(k);
-  if (beyond >= s.goes_on) return;
-  out[0] = ahead;
-  out[1] = off / count;
-  // Tape that runs back has turned by more than a right angle.
-  out[2] = far / count < ahead ? -along / count : along / count;
-}
-
 // --- Python ---
 
 PyObject* refine(PyObject*, PyObject* args) {
@@ -721,76 +515,8 @@ PyObject* refine(PyObject*, PyObject* args) {
   }
 }
 
-PyObject* corners(PyObject*, PyObject* args) {
-  Buffer lines, edges, normals, numbers;
-  int single;
-  if (!PyArg_ParseTuple(args, "y*y*y*y*p", &lines.view, &edges.view, &normals.view, &numbers.view, &single))
-    return nullptr;
-  if (lines.size<double>() % (kRows + 1)) return refuse("lines: points and markings differ in number");
-  const size_t m = lines.size<double>() / (kRows + 1), pair = 2 * (single ? sizeof(float) : sizeof(double));
-  if (edges.view.len % pair || normals.view.len != edges.view.len)
-    return refuse("edges: points and normals differ in number");
-  if (numbers.view.len != sizeof(CornerNumbers)) return refuse("numbers: not of this size");
-  CornerNumbers s;
-  std::memcpy(&s, numbers.view.buf, sizeof s);
-  if (!(s.next_cm > 0.0 && s.meet_cm <= s.next_cm && (s.far_cm - s.near_cm) / s.next_cm < kMostColumns))
-    return refuse("numbers: not those that this was compiled for");
-  PyObject* result = PyByteArray_FromStringAndSize(nullptr, m * kPerCorner * sizeof(double));
-  if (!result) return nullptr;
-  try {
-    static Middles middles;  // one caller at a time: the interpreter's lock is held
-    double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
-    std::fill_n(out, m * kPerCorner, kNaN);
-    const size_t n = edges.view.len / pair;
-    for (size_t i = 0; i < m; ++i) {
-      const double* line = lines.as<double>() + (kRows + 1) * i;
-      const bool any = single ? take_middles(s, line, edges.as<float>(), normals.as<float>(), n, middles)
-                              : take_middles(s, line, edges.as<double>(), normals.as<double>(), n, middles);
-      if (any) find_corner(s, middles, out + kPerCorner * i);
-    }
-    return result;
-  } catch (const std::exception&) {
-    Py_DECREF(result);
-    return PyErr_NoMemory();
-  }
-}
-
-PyObject* distances(PyObject*, PyObject* args) {
-  Buffer lefts, rights, basis, compared;
-  int begin, end;
-  if (!PyArg_ParseTuple(args, "y*y*y*y*ii", &lefts.view, &rights.view, &basis.view, &compared.view, &begin, &end))
-    return nullptr;
-  if (lefts.size<double>() % 3 || rights.size<double>() % 3 || basis.size<double>() != 9)
-    return refuse("lines: expected three points each");
-  const int n = static_cast<int>(compared.size<double>());
-  if (begin < 0 || end <= begin || end > n) return refuse("compared: nothing lies between");
-  try {
-    const size_t l = lefts.size<double>() / 3, r = rights.size<double>() / 3;
-    const double* y = compared.as<double>();
-    std::vector<double> x((l + r) * n), nearest(2 * (end - begin));
-    for (size_t i = 0; i < l + r; ++i) {
-      const double* points = i < l ? lefts.as<double>() + 3 * i : rights.as<double>() + 3 * (i - l);
-      const Parabola curve = parabola_of(basis.as<double>(), points);
-      for (int k = 0; k < n; ++k) x[i * n + k] = (curve.a * y[k] + curve.b) * y[k] + curve.c;
-    }
-    PyObject* result = PyByteArray_FromStringAndSize(nullptr, l * r * sizeof(double));
-    if (!result) return nullptr;
-    double* out = reinterpret_cast<double*>(PyByteArray_AsString(result));
-    for (size_t i = 0; i < l; ++i)
-      for (size_t j = 0; j < r; ++j) {
-        const double gap = rights.as<double>()[3 * j + 1] - lefts.as<double>()[3 * i + 1];
-        *out++ = distance_of(&x[i * n], &x[(l + j) * n], y, n, begin, end, nearest.data()) * sign_of(gap);
-      }
-    return result;
-  } catch (const std::exception&) {
-    return PyErr_NoMemory();
-  }
-}
-
 PyMethodDef methods[] = {
     {"refine", refine, METH_VARARGS, nullptr},
-    {"corners", corners, METH_VARARGS, nullptr},
-    {"distances", distances, METH_VARARGS, nullptr},
     {nullptr, nullptr, 0, nullptr},
 };
 

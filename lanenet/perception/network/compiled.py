@@ -15,8 +15,8 @@ from lanenet.perception.edges.road import RoadEdges
 
 _kernels: Any = loops_of("lanenet.perception.network")
 
-#: Numbers per line that :func:`refine` returns, and :func:`corners`.
-_PER_LINE, _PER_CORNER = 15, 3
+#: Numbers per line that :func:`refine` returns.
+_PER_LINE = 15
 
 
 def is_here() -> bool:
@@ -39,40 +39,3 @@ def refine(
     lines = np.ascontiguousarray(asked, np.float64)
     found = _kernels.refine(lines, *seen, numbers, edges.points_cm.dtype == np.float32)
     return np.frombuffer(found).reshape(-1, _PER_LINE)
-
-
-def corners(
-    lines: Float[np.ndarray, "m 4"], edges: RoadEdges, numbers: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "m 3"]:
-    """Find the corners at which tape turns off lines, as :mod:`lanenet.perception.network.corner`.
-
-    Args:
-        lines: Of each line its points and the width of its marking.
-        edges: The frame's edge points, all float32 or all float64.
-        numbers: The settings, in the order of ``CornerNumbers`` in ``_kernels.cpp``.
-    """
-    points, normals = np.ascontiguousarray(edges.points_cm), np.ascontiguousarray(edges.normals)
-    asked = np.ascontiguousarray(lines, np.float64)
-    found = _kernels.corners(asked, points, normals, numbers, points.dtype == np.float32)
-    return np.frombuffer(found).reshape(-1, _PER_CORNER)
-
-
-def distances(
-    lefts_cm: Float[np.ndarray, "l 3"],
-    rights_cm: Float[np.ndarray, "r 3"],
-    basis: Float[np.ndarray, "3 3"],
-    compared: Float[np.ndarray, "k"],
-    between: tuple[int, int],
-) -> Float[np.ndarray, "l r"]:
-    """Compare lines as :func:`lanenet.perception.network.tracking.pair.distances_cm` does.
-
-    Args:
-        lefts_cm: x at the label rows.
-        rights_cm: Likewise.
-        basis: (a, b, c) = x at the label rows @ basis.
-        compared: y at which the lines are compared.
-        between: The first of these that counts, and the one after the last.
-    """
-    lefts, rights = (np.ascontiguousarray(x, np.float64) for x in (lefts_cm, rights_cm))
-    found = _kernels.distances(lefts, rights, basis, compared, *between)
-    return np.frombuffer(found).reshape(len(lefts), -1)

@@ -15,24 +15,31 @@ from lanenet.geometry.birdseye import BirdseyeWindow
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import (
     ROWS_CM,
-    SIDES,
     lane_width_cm,
     parabola_through,
     proportional_angle_rad,
-    rows_of_polyline,
 )
 from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import RoadEdgeExtractor, RoadEdges
 from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, LaneEstimate, LaneMemory
-from lanenet.perception.network.model_file import INPUT_NAME, WIDTH_NAME, ModelMeta, open_model
-from lanenet.perception.network.tracking.camera_view import CameraView
-from lanenet.perception.network.tracking.lane_belief import Keep
-from lanenet.perception.network.tracking.tracker import LaneTracker
+from lanenet.perception.network.lane.filter import NOTHING_SEEN, LaneFilter
+from lanenet.perception.network.lane.looks import Keep
+from lanenet.perception.network.lane.network_answer import NetworkAnswer
+from lanenet.perception.network.lane.view import LinesInView
+from lanenet.perception.network.model_file import (
+    INPUT_NAME,
+    LOG_SHARE_NAME,
+    WIDTH_NAME,
+    ModelMeta,
+    open_model,
+)
 
 log = logging.getLogger(__name__)
 
-#: What the network is asked for.
+#: What the network is asked for, beside the probabilities of places, which not every model has.
 _ANSWERS = ("points_cm", "sigma_cm", "presence")
+#: Places of the one mode that stands for a model without their probabilities. Chosen: as networks have.
+_PLACES = 64
 
 #: A frame with more edges than this share of its road pixels is noise. Chosen: above the lane filter's 0.1,
 #: since a network copes with more clutter.
@@ -52,12 +59,8 @@ _ONE_LINE = 0.05
 #: Length along the road, [cm], from which a line is seen on its edges; below it what the network says of it
 #: counts by half. Chosen: three bins of the refinement.
 _SEEN_CM = 9.0
-#: Presence that counts of lines that are continued over a junction. Chosen: the car goes on, and slower,
-#: since a bend whose outer line is worn off looks like a junction.
-_CONTINUED = 0.3
-#: Confidence, and presence, around a sharp corner, of which both lines were seen. Chosen: the car goes on,
-#: and slower. The six points would make it 0 where no line crosses the row 15 cm ahead.
-_AROUND_CORNER = 0.6
+#: Why a frame is not answered that is all edges.
+_CROWDED = "the frame is all edges"
 #: Label row at which the car aims, 15 cm ahead.
 _AIM = 1
 
@@ -110,10 +113,14 @@ class NetworkDetector:
         self.problems = self.meta.untrained_widths(widths_cm, str(model_path))
         self._told, self._keeps = False, keeps
         self.memory = LaneMemory(lane_width_cm, self.meta.widths_cm)
-        self._tracker = LaneTracker(self.memory, keep, CameraView(camera))
         self._extractor = RoadEdgeExtractor(camera, self.meta.perception, mask)
+        self._filter = LaneFilter(self.memory, LinesInView(camera, self._extractor.table.keep), keep)
         self._raster = new_raster(self.meta.window, self.meta.planes)
         self._feed: dict[str, np.ndarray] = {INPUT_NAME: self._raster[None]}
+        places = {o.name: o.shape[-1] for o in self._session.get_outputs()}.get(LOG_SHARE_NAME)
+        self._answers = _ANSWERS if places is None else (*_ANSWERS, LOG_SHARE_NAME)
+        ends_cm = self.meta.window.left_cm, self.meta.window.right_cm
+        self._places_cm: Float[np.ndarray, "b"] = np.linspace(*ends_cm, places or _PLACES)
 
     def detect(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
         """Find the lane in one frame.
@@ -131,27 +138,25 @@ class NetworkDetector:
         """Find the lane in the edge points of one frame, as label sets hold them; as :meth:`detect`."""
         if not self._keeps:
             self.memory.reset()
-            self._tracker.reset()
-        if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE) or not np.count_nonzero(
-            fill_raster(self.meta.window, edges, self._raster)[0]
-        ):
-            self._tracker.lose()
-            return LaneEstimate()
-        points_cm, sigma_cm, presence = self._run()
-        points_cm, sigma_cm, seen_cm = self._tracker.follow(points_cm, sigma_cm, presence, edges)
+            self._filter.reset()
+        if self._extractor.is_crowded(len(edges.points_cm), _MAX_EDGE_SHARE):
+            self._filter.lose()
+            return LaneEstimate(reason=_CROWDED)
+        if not np.count_nonzero(fill_raster(self.meta.window, edges, self._raster)[0]):
+            self._filter.lose()
+            return LaneEstimate(reason=NOTHING_SEEN)
+        answer = self._run()
+        lane = self._filter.follow(answer, edges)
         if not self._told and (contradiction := self.memory.contradiction):
             self._told = True
             self.problems.append(contradiction)
             log.warning(contradiction)
-        if self._tracker.corner.on:
-            return self._around_corner(points_cm, sigma_cm)
-        if self._tracker.straight_on.on:
-            presence = confirmed = np.full_like(presence, _CONTINUED)
-        else:
-            # Plain numbers: for two of them arrays cost more than they save.
-            both = zip(presence.tolist(), seen_cm.tolist(), strict=True)
-            confirmed = np.array([max(p, SURE) if seen >= _SEEN_CM else 0.5 * p for p, seen in both])
-        return self._estimate(points_cm, sigma_cm, presence, confirmed)
+        # Plain numbers: for two of them arrays cost more than they save.
+        both = zip(answer.presence.tolist(), lane.seen_cm.tolist(), strict=True)
+        confirmed = np.array(
+            [min(max(p, SURE), p + 0.5) if seen >= _SEEN_CM else 0.5 * p for p, seen in both]
+        )
+        return self._estimate(lane.points_cm, lane.sigma_cm, answer.presence, confirmed, lane.reason)
 
     def __call__(self, frame_bgr: UInt8[np.ndarray, "h w 3"]) -> LaneEstimate:
         """Find the lane in one frame, as :meth:`detect`."""
@@ -162,18 +167,20 @@ class NetworkDetector:
         self._raster[:] = raster[: len(self._raster)]
         if not np.count_nonzero(self._raster[0]):
             return LaneEstimate()
-        points_cm, sigma_cm, presence = self._run()
+        points_cm, sigma_cm, presence, *_ = self._run()
         points_cm, sigma_cm = self.memory.complete(points_cm, sigma_cm, presence)
         self.memory.learn(points_cm, presence)
         return self._estimate(points_cm, sigma_cm, presence, presence)
 
-    def _run(self) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"], Float[np.ndarray, "2"]]:
+    def _run(self) -> NetworkAnswer:
         """Run the network on the raster, with the lane's width as soon as it is known."""
         if self.meta.takes_width:
             self._feed[WIDTH_NAME] = np.array([self.memory.width_cm or 0.0], np.float32)
-        found = self._session.run(_ANSWERS, self._feed)
-        points_cm, sigma_cm, presence = (np.asarray(values[0], np.float64) for values in found)
-        return points_cm, sigma_cm, presence
+        found = self._session.run(self._answers, self._feed)
+        points_cm, sigma_cm, presence, *shares = (np.asarray(values[0], np.float64) for values in found)
+        if shares:
+            return NetworkAnswer(points_cm, sigma_cm, presence, shares[0], self._places_cm)
+        return NetworkAnswer.of_one_mode(points_cm, sigma_cm, presence, self._places_cm)
 
     def _estimate(
         self,
@@ -181,6 +188,7 @@ class NetworkDetector:
         sigma_cm: Float[np.ndarray, "6"],
         presence: Float[np.ndarray, "2"],
         confirmed: Float[np.ndarray, "2"],
+        reason: str = "",
     ) -> LaneEstimate:
         """Return the answer; ``confirmed`` is the presence that the confidence counts."""
         width_cm = self.memory.width_cm
@@ -191,35 +199,18 @@ class NetworkDetector:
             steering_rad=math.nan if math.isnan(aim_cm) else proportional_angle_rad(aim_cm, ROWS_CM[_AIM]),
             confidence=confidence(points_cm, sigma_cm, confirmed, self.meta.widths_cm, width_cm),
             presence=presence,
-            own_lane=self._tracker.looks.own_lane,
-        )
-
-    def _around_corner(
-        self, points_cm: Float[np.ndarray, "6"], sigma_cm: Float[np.ndarray, "6"]
-    ) -> LaneEstimate:
-        """Return the answer at a sharp corner, whose centre the points do not tell."""
-        corner = self._tracker.corner.corner
-        assert corner is not None
-        centre_line_cm = corner.line_cm(0.0)
-        aim_cm = float(rows_of_polyline(centre_line_cm)[_AIM])
-        return LaneEstimate(
-            points_cm=points_cm,
-            sigma_cm=sigma_cm,
-            steering_rad=math.nan if math.isnan(aim_cm) else proportional_angle_rad(aim_cm, ROWS_CM[_AIM]),
-            confidence=_AROUND_CORNER,
-            presence=np.full(len(SIDES), _AROUND_CORNER),
-            own_lane=self._tracker.looks.own_lane,
-            centre_line_cm=centre_line_cm,
+            own_lane=self._filter.looks.own_lane,
+            reason=reason,
         )
 
     def moved(self, travel_cm: float, turn_rad: float, wheelbase_cm: float) -> None:
         """Take the car's motion since the last frame; as :class:`lanenet.perception.estimate.TakesMotion`."""
-        self._tracker.moved(travel_cm, turn_rad, wheelbase_cm)
+        self._filter.moved(travel_cm, turn_rad, wheelbase_cm)
 
     def reset(self) -> None:
         """Forget the lane and its markings; its width stays likely, since most roads stay the same."""
         self.memory.doubt()
-        self._tracker.reset()
+        self._filter.reset()
 
 
 def _check_camera(meta: ModelMeta, camera: Camera, model_path: Path) -> None:

@@ -155,19 +155,6 @@ def test_a_detector_that_follows_the_lane_is_told_how_the_car_moves() -> None:
     assert motion == pytest.approx((3.0, 3.0 * math.tan(0.2) / wheelbase_cm, wheelbase_cm))
 
 
-def test_around_a_corner_the_car_follows_the_lanes_centre() -> None:
-    # The points go straight on; the centre turns to the left beside the car.
-    centre = np.array([[0.0, -80.0], [0.0, 10.0], [-90.0, 20.0]])
-    controller = LaneController(settings(speed={"cruise_cm_s": 200.0}))
-    ahead = controller.target(LaneEstimate(lane(), confidence=0.5), t_s=0.0)
-    around = controller.target(LaneEstimate(lane(), confidence=0.5, centre_line_cm=centre), t_s=0.05)
-    assert ahead.steering_rad == 0.0 and around.steering_rad > 0.2
-    assert around.speed_cm_s < ahead.speed_cm_s
-    # An answer that is impossible in itself leads nowhere, with or without a corner.
-    crossed = LaneEstimate(lane()[[3, 4, 5, 0, 1, 2]], confidence=0.5, centre_line_cm=centre)
-    assert math.isnan(controller.target(crossed, t_s=0.1).steering_rad)
-
-
 def test_the_detectors_own_target_stays_within_the_lock() -> None:
     controller = LaneController(settings(own_target=True))
     assert controller.target(LaneEstimate(steering_rad=0.1), 0.0).steering_rad == 0.1

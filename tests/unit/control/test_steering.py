@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from lanenet.config import check_settings
 from lanenet.control.steering import (
     SteeringSettings,
-    corner_target_rad,
     lane_centre_cm,
     steering_target_rad,
 )
@@ -101,49 +100,3 @@ def test_settings_refuse_nonsense() -> None:
         settings(law="stanley")
     with pytest.raises(ConfigError, match="max_steering_rad"):
         settings(max_steering_rad=2.0)
-
-
-def corner(ahead_cm: float, turn_deg: float) -> np.ndarray:
-    """The centre of a lane straight ahead that turns there, to the right."""
-    turn = math.radians(turn_deg)
-    place = np.array([0.0, ahead_cm])
-    return np.array([place - [0.0, 90.0], place, place + 90.0 * np.array([math.sin(turn), math.cos(turn)])])
-
-
-@pytest.mark.parametrize("law", ["proportional", "pure-pursuit"])
-@pytest.mark.parametrize("turn_deg", [45.0, 70.0, 90.0])
-def test_a_corner_is_steered_into_as_early_as_the_car_needs(turn_deg: float, law: str) -> None:
-    # The tightest circle of the front axle begins R tan(t / 2) before the corner; the aim is 15 cm ahead.
-    car = settings(law=law)
-    begins_cm = 26.0 / math.sin(0.45) * math.tan(math.radians(0.5 * turn_deg)) + 15.0
-    assert corner_target_rad(corner(begins_cm + 1.0, turn_deg), car) == 0.0
-    steered = [corner_target_rad(corner(begins_cm - back_cm, turn_deg), car) for back_cm in (2.0, 8.0, 14.0)]
-    assert 0.0 > steered[0] > steered[1] > steered[2]
-
-
-def test_a_corner_to_the_left_is_the_mirrored_one() -> None:
-    for ahead_cm in (40.0, 20.0, 5.0, -5.0):
-        right, left = (corner_target_rad(corner(ahead_cm, turn), settings()) for turn in (70.0, -70.0))
-        assert right == -left and right < 0.0
-
-
-def test_a_narrow_lane_is_cut_less() -> None:
-    # 0.15 of 20 cm beside the centre: that is the radius of the arc times 1 / cos 35 deg - 1.
-    begins_cm = 3.0 / (1.0 / math.cos(math.radians(35.0)) - 1.0) * math.tan(math.radians(35.0)) + 15.0
-    assert corner_target_rad(corner(begins_cm + 0.5, 70.0), settings(), lane_width_cm=20.0) == 0.0
-    assert corner_target_rad(corner(begins_cm - 2.0, 70.0), settings(), lane_width_cm=20.0) < 0.0
-    assert corner_target_rad(corner(begins_cm + 0.5, 70.0), settings(lane_width_cm=20.0)) == 0.0
-    assert corner_target_rad(corner(begins_cm + 0.5, 70.0), settings(lane_width_cm=60.0)) < 0.0
-
-
-def test_a_car_far_beside_a_corner_steers_back_within_the_lock() -> None:
-    line = corner(30.0, 80.0) - [40.0, 0.0]
-    assert corner_target_rad(line, settings()) == pytest.approx(0.45)
-    # Beyond the corner, and of none at all, too.
-    assert corner_target_rad(corner(-60.0, 80.0), settings()) == pytest.approx(-0.45)
-    assert corner_target_rad(corner(30.0, 0.0), settings()) == 0.0
-
-
-def test_a_car_with_hardly_any_lock_rounds_no_more_than_it_is_told_of() -> None:
-    angle = corner_target_rad(corner(60.0, 90.0), settings(max_steering_rad=0.05))
-    assert -0.05 <= angle <= 0.0

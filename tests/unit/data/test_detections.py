@@ -49,6 +49,20 @@ def test_round_trip(tmp_path: Path, name: str) -> None:
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
+@pytest.mark.parametrize("name", ["seen.csv", "seen.parquet"])
+def test_why_a_frame_is_not_answered_is_a_column_where_a_detector_says_so(tmp_path: Path, name: str) -> None:
+    table = DetectionTable()
+    table.add(0, 0.0, FULL)
+    table.add(1, 0.1, LaneEstimate(reason="two lanes compete, or none"))
+    table.write(tmp_path / name)
+    read = pyarrow.csv.read_csv if name.endswith(".csv") else pq.read_table
+    assert [text or "" for text in read(tmp_path / name)["reason"].to_pylist()] == [
+        "",
+        "two lanes compete, or none",
+    ]
+    assert len(read_detections(tmp_path / name).frame) == 2
+
+
 def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
     make_table().write(tmp_path / "seen.csv")
     header = (tmp_path / "seen.csv").read_text().splitlines()[0].split(",")

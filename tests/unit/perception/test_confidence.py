@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lanenet.geometry.lane import lane_width_cm, mirror_points
-from lanenet.onboard.safety import SafetySettings
-from lanenet.perception.network.detector import _CONTINUED, confidence
+from lanenet.perception.network.detector import confidence
 
 LANE = np.array([-20.0, -20.0, -20.0, 20.0, 20.0, 20.0])
 SURE, BOTH, WIDTHS = np.zeros(6), np.ones(2), (40.0, 40.0)
@@ -87,9 +86,3 @@ def test_it_stays_between_0_and_1_and_sinks_with_doubt(left, right, sigma, width
     value = confidence(lane, np.full(6, sigma), presence, (30.0, 60.0))
     assert 0.0 <= value <= 1.0
     assert confidence(lane, np.full(6, sigma + 1.0), presence, (30.0, 60.0)) <= value
-
-
-def test_over_a_junction_the_car_slows_down_and_does_not_stop():
-    assert confidence(LANE, SURE, np.full(2, _CONTINUED), WIDTHS) > SafetySettings().stop_below
-    assert confidence(LANE, np.full(6, 2.0), np.full(2, _CONTINUED), WIDTHS) > SafetySettings().stop_below
-    assert confidence(LANE, np.ones(6), np.full(2, _CONTINUED), WIDTHS) < SafetySettings().slow_below

@@ -38,8 +38,6 @@ def test_a_lane_with_both_lines_tells_its_width_within_a_second(width_cm):
 def test_two_widths_live_side_by_side_until_frames_decide():
     memory = taught([30.0, 60.0] * 10)
     assert memory.width_cm is None
-    rates = memory.match(np.array([30.0, 42.4, 60.0]), 0.1)
-    assert min(rates[0], rates[2]) > 2.0 * rates[1]
     for _ in range(20):
         memory.learn(LANE * 1.5, BOTH)
     assert memory.width_cm == pytest.approx(60.0, rel=0.03)
@@ -62,9 +60,9 @@ def test_a_width_in_doubt_is_kept_until_a_few_frames_say_otherwise():
 
 
 def test_before_any_frame_common_lanes_are_likelier():
-    memory = LaneMemory()
-    assert memory.match(np.array([40.0]), 0.2) > 0.95 > 0.5 > memory.match(np.array([120.0]), 0.2)
-    np.testing.assert_allclose(LaneMemory(120.0).match(np.array([120.0, 240.0]), 0.2), [1.0, 0.0], atol=0.01)
+    assert LaneMemory().width_cm is None
+    assert LaneMemory().likely_cm == pytest.approx(40.0, rel=0.02)
+    assert LaneMemory(120.0).likely_cm == LaneMemory(120.0).width_cm == 120.0
 
 
 @pytest.mark.parametrize(("presence", "sigma", "seen"), [(LEFT, LOST_RIGHT, 0), (RIGHT, LOST_LEFT, 1)])

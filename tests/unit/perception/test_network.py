@@ -22,9 +22,8 @@ from lanenet.perception.edges.raster import fill_raster, new_raster
 from lanenet.perception.edges.road import PerceptionSettings, RoadEdgeExtractor
 from lanenet.perception.estimate import DetectorInputs, LaneMemory
 from lanenet.perception.network.detector import NetworkDetector
+from lanenet.perception.network.lane.filter import LaneFilter
 from lanenet.perception.network.model_file import HASH_NAME, ModelMeta, read_model_meta, sealed
-from lanenet.perception.network.tracking.lane_corner import LaneCorner, Leg
-from lanenet.perception.network.tracking.tracker import LaneTracker
 from lanenet.perception.registry import build_detector
 
 torch.set_num_threads(1)
@@ -102,27 +101,6 @@ def test_a_frame_gives_points_errors_and_steering(model_path):
     assert 0.0 < estimate.confidence <= 1.0
 
 
-def test_around_a_corner_the_answer_has_the_lanes_centre(model_path, monkeypatch):
-    detector = NetworkDetector(model_path, CAMERA)
-    assert detector.detect(striped_frame()).centre_line_cm is None
-    tracker = detector._tracker
-    # 70 degrees to the right, at 10 cm: no line crosses the row 15 cm ahead at less than 45 degrees.
-    tracker.corner.corner = LaneCorner(Leg(0.0, 0.0, 0.0), Leg(0.0, 0.0, math.radians(70.0)), 40.0)
-    tracker.corner.on = True
-    monkeypatch.setattr(tracker, "_at_corner", lambda borders: True)
-    estimate = detector.detect(striped_frame())
-    assert estimate.centre_line_cm is not None and estimate.centre_line_cm[1] == pytest.approx([0.0, 0.0])
-    assert estimate.centre_line_cm[2] == pytest.approx(
-        90.0 * np.array([math.sin(math.radians(70.0)), math.cos(math.radians(70.0))])
-    )
-    assert estimate.points_cm[:2] == pytest.approx([-20.0, np.nan], nan_ok=True)
-    assert 0.5 < estimate.confidence < 0.7 and (estimate.presence > 0.5).all()
-    # The centre crosses the row 15 cm ahead at 15 tan(70 deg).
-    assert estimate.steering_rad == pytest.approx(-math.radians(70.0))
-    detector.reset()
-    assert not tracker.corner.on
-
-
 def test_a_mask_hides_the_car(model_path):
     frame = striped_frame()
     # A bumper with a bright edge, which is no road.
@@ -133,7 +111,8 @@ def test_a_mask_hides_the_car(model_path):
     masked, plain = NetworkDetector(model_path, CAMERA, mask=mask), NetworkDetector(model_path, CAMERA)
     hidden = masked.detect(bumper).points_cm
     masked.reset()
-    np.testing.assert_array_equal(hidden, masked.detect(frame).points_cm)
+    # The width that a frame showed stays likely.
+    np.testing.assert_allclose(hidden, masked.detect(frame).points_cm, atol=1e-3)
     assert (plain.detect(bumper).points_cm != plain.detect(frame).points_cm).any()
     with pytest.raises(CalibrationError, match=r"mask of 80x60 px.*160x120"):
         NetworkDetector(model_path, CAMERA, mask=mask[::2, ::2])
@@ -146,11 +125,12 @@ def test_frames_do_not_leak_into_each_other(model_path):
     assert not empty.mask.any() and empty.confidence == 0.0 and math.isnan(empty.steering_rad)
     detector.reset()
     again = detector.detect(striped_frame())
-    np.testing.assert_array_equal(first.points_cm, again.points_cm)
+    # The width that a frame showed stays likely.
+    np.testing.assert_allclose(first.points_cm, again.points_cm, atol=1e-3)
     # What the caller does with a result does not reach the next one.
     again.sigma_cm[:] = 99.0
     detector.reset()
-    np.testing.assert_array_equal(detector.detect(striped_frame()).sigma_cm, first.sigma_cm)
+    np.testing.assert_allclose(detector.detect(striped_frame()).sigma_cm, first.sigma_cm, rtol=1e-2)
 
 
 def test_a_frame_gives_what_its_raster_gives_on_the_markings(model_path):
@@ -341,12 +321,26 @@ def test_a_frame_of_noise_gives_no_lane(model_path):
     noise = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
     estimate = NetworkDetector(model_path, CAMERA).detect(noise)
     assert not estimate.mask.any() and estimate.confidence == 0.0
+    assert estimate.reason == "the frame is all edges"
+    dark = NetworkDetector(model_path, CAMERA).detect(np.zeros_like(noise))
+    assert dark.reason == "no edge in view" and not dark.mask.any()
+
+
+def test_a_network_that_answers_no_numbers_gives_no_lane(model_path, monkeypatch):
+    detector = NetworkDetector(model_path, CAMERA)
+    answer = detector._run()
+    broken = answer._replace(sigma_cm=np.full(6, np.nan))
+    monkeypatch.setattr(detector, "_run", lambda: broken)
+    estimate = detector.detect(striped_frame())
+    assert not estimate.mask.any() and estimate.confidence == 0.0 and "no number" in estimate.reason
+    monkeypatch.setattr(detector, "_run", lambda: answer)
+    assert detector.detect(striped_frame()).mask.any()
 
 
 @pytest.mark.parametrize("frame", ["noise", "dark"])
 def test_the_lane_is_lost_in_frames_that_show_nothing(model_path, monkeypatch, frame):
     lost = []
-    monkeypatch.setattr(LaneTracker, "lose", lambda self: lost.append(1))
+    monkeypatch.setattr(LaneFilter, "lose", lambda self: lost.append(1))
     detector = NetworkDetector(model_path, CAMERA)
     shape = CAMERA.height, CAMERA.width, 3
     noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)

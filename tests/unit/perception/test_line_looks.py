@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from lanenet.perception.network.tracking.lane_belief import LineLooks
+from lanenet.perception.network.lane.looks import LineLooks
 
 YELLOW_DASHES, WHITE = [0.8, 0.2, 0.2], [0.0, 0.0, 0.02]
 WHITE_DASHES = [0.0, 0.0, 0.25]
@@ -39,20 +39,14 @@ def test_beyond_the_middle_is_the_other_lane_whose_right_line_that_is():
     looks = seen("right", YELLOW_DASHES, WHITE)
     looks.cross(0)
     assert looks.own_lane < 0.05
-    assert looks.unlike(1, WHITE) > 0.9 and looks.unlike(1, YELLOW_DASHES) < 0.01
-    # Of the line beyond it nothing is known.
-    assert looks.unlike(0, WHITE) == looks.unlike(0, YELLOW_DASHES) == 0.0
+    # The line beyond it is as white as the one that was left: that stays the other lane.
+    for _ in range(40):
+        looks.remember(0, WHITE)
+        looks.judge()
+    assert looks.own_lane < 0.05
 
 
 def test_nothing_is_known_after_a_reset():
     looks = seen("right", YELLOW_DASHES, WHITE)
     looks.reset()
-    assert looks.own_lane == 0.5 and looks.unlike(0, WHITE) == 0.0
-
-
-@pytest.mark.parametrize("middle", [YELLOW_DASHES, WHITE_DASHES])
-def test_the_line_between_the_lanes_is_known_without_a_rule_of_the_road(middle):
-    looks = seen(None, middle, WHITE)
-    assert looks.is_between_lanes(0) and not looks.is_between_lanes(1)
-    assert not seen(None, WHITE, WHITE).is_between_lanes(0)
-    assert not seen(None, middle, WHITE, frames=9).is_between_lanes(0)
+    assert looks.own_lane == 0.5

@@ -21,17 +21,9 @@ _LENGTH, _ENOUGH = 100, 10
 #: drives yellow lines had a mean of 0.4 to 1 and most white ones one within 0.2, dashes 0.1 to 0.3 and most
 #: solid lines 0 to 0.1; on `donkey_circuit` yellow dashes have 0.33 and 0.07, the white line 0.04 and 0.02.
 _YELLOWER, _MORE_GAPS = 0.4, 0.15
-#: From this share of what is plain, a line is the one between two lanes. Chosen.
-_BETWEEN = 0.5
-#: Least share of gaps of a line that is not solid. Of those tried, from 0.05 to 0.2, the one that tells best
-#: where a line turns away unseen: there a third of the points on `garage_tape` were more than 3 cm off.
-_SOLID = 0.05
 #: Log odds that a plain frame adds, and what a frame keeps of the sum: in the end 6, 400 to 1. Chosen:
 #: neighbouring frames show the same metre of road, so that each says little, and a second says enough.
 _PLAIN, _KEPT = 0.3, 0.95
-#: Difference of hues that is common within one marking. Tried from 0.15 to 0.25.
-_HUE_SIGMA = 0.25
-_NO_HUES = math.nan, math.nan
 
 
 def _last() -> RollingMedian:
@@ -40,12 +32,10 @@ def _last() -> RollingMedian:
 
 @dataclass
 class _Line:
-    """What the last frames show of one line; its hues are medians, NaN until enough of them showed it."""
+    """What the last frames show of one line."""
 
     yellow: RollingMedian = field(default_factory=_last)
-    red: RollingMedian = field(default_factory=_last)
     gaps: deque[float] = field(default_factory=lambda: deque(maxlen=_LENGTH))
-    hues: tuple[float, float] = _NO_HUES
 
     @property
     def known(self) -> bool:
@@ -80,12 +70,9 @@ class LineLooks:
             side: 0 for the left line, 1 for the right one.
             look: See :class:`lanenet.perception.network.refinement.RefinedLines`.
         """
-        line, (yellow, red, gaps) = self._lines[side], look
+        line, (yellow, _, gaps) = self._lines[side], look
         line.yellow.append(yellow)
-        line.red.append(red)
         line.gaps.append(gaps)
-        if line.known:
-            line.hues = line.yellow.median, line.red.median
 
     def judge(self) -> None:
         """Weigh what both lines look like, once per frame."""
@@ -97,31 +84,11 @@ class LineLooks:
         sign = 1.0 if self.keep == "right" else -1.0
         self._log_odds += sign * _PLAIN * max(-1.0, min(1.0, like_own))
 
-    def is_between_lanes(self, side: int) -> bool:
-        """Return whether a line is plainly one between two lanes: yellower than the other, or with gaps."""
-        line, other = self._lines[side], self._lines[1 - side]
-        return line.known and other.known and self._between_lanes(line, other) > _BETWEEN
-
-    def is_solid(self, side: int) -> bool:
-        """Return whether a line is known to have no gaps."""
-        line = self._lines[side]
-        return line.known and statistics.fmean(line.gaps) < _SOLID
-
     @staticmethod
     def _between_lanes(line: _Line, other: _Line) -> float:
         """By how much a line is yellower than the other one and has more gaps; 1 where that is plain."""
         gaps = statistics.fmean(line.gaps) - statistics.fmean(other.gaps)
         return (line.yellow.median - other.yellow.median) / _YELLOWER + gaps / _MORE_GAPS
-
-    def hues(self, side: int | None) -> tuple[float, float]:
-        """Return by how much a line is yellower and redder than the floor; NaN while unknown, or of none."""
-        return _NO_HUES if side is None else self._lines[side].hues
-
-    def unlike(self, side: int | None, look: Sequence[float]) -> float:
-        """Return how surely a marking is another one than a line, by its hue: 0 to 1, 0 while unknown."""
-        yellow, red = self.hues(side)
-        off = math.hypot(yellow - look[0], red - look[1]) / _HUE_SIGMA
-        return 0.0 if math.isnan(off) else 1.0 - math.exp(-0.5 * off * off)
 
     def cross(self, side: int) -> None:
         """Go to the lane beyond the left line, 0, or the right one, 1: it is now on the other side."""

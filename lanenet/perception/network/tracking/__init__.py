@@ -1,1 +1,0 @@
-"""The lane from frame to frame, on the network's lines and the edges that confirm them."""
