@@ -23,13 +23,6 @@ def tape(path_cm: np.ndarray, marking_cm: float) -> RoadEdges:
     return RoadEdges(np.concatenate(points), np.concatenate(normals))
 
 
-def turned(turn_deg: float, corner_cm: float = 60.0) -> np.ndarray:
-    """A line straight ahead that turns to the right."""
-    turn = np.radians(turn_deg)
-    corner = np.array([-20.0, corner_cm])
-    return np.array([[-20.0, 0.0], corner, corner + 80.0 * np.array([np.sin(turn), np.cos(turn)])])
-
-
 def together(*edges: RoadEdges) -> RoadEdges:
     """The edge points of several tapes."""
     points, normals = zip(*((each.points_cm, each.normals) for each in edges), strict=True)

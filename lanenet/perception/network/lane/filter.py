@@ -106,6 +106,7 @@ class LaneFilter:
     ) -> None:
         """Know no lane yet."""
         self.lane, self._settings = lane, settings or LaneFilterSettings()
+        self._doubt_squares = np.square(self._settings.doubt.weights)
         self.looks, self._lines = LineLooks(keep), LineFinder(view, self._settings.borders)
         self.reset()
 
@@ -152,12 +153,16 @@ class LaneFilter:
         shape = (s.shape_cm + s.shape_per_cm * ROW_CM) ** 2
         variance = variances(change, found.covariances) + shape
         lines = self._lines.find(points, np.sqrt(variance), borders)
-        found = found.updated(
-            expected, lines.points_cm, np.sqrt(lines.sigma_cm**2 + shape), s.network.correlation
+        before, found = (
+            found,
+            found.updated(
+                expected, lines.points_cm, np.sqrt(lines.sigma_cm**2 + shape), s.network.correlation
+            ),
         )
         # Where a line shows no border it may turn away.
         shape = shape + (s.bend_per_cm * ROW_CM * np.repeat(lines.unseen, _ROWS, axis=1)) ** 2
-        points, change = linearised(found.states)
+        # To first order: edges move a lane that the network has placed by little.
+        points = points + (change @ (found.states - before.states)[..., None])[..., 0]
         variance = variances(change, found.covariances) + shape
         gain = variance / (variance + lines.sigma_cm**2)
         points = points + gain * (lines.points_cm - points)
@@ -203,7 +208,8 @@ class LaneFilter:
             factor * noise.curvature_per_cm,
             noise.log_width,
         )
-        covariances = self._found.covariances + np.diag(np.square(sigma))
+        covariances = self._found.covariances.copy()
+        covariances[:, range(len(sigma)), range(len(sigma))] += np.square(sigma)
         self._found = self._found._replace(covariances=covariances)
 
     def _with_births(
@@ -388,7 +394,7 @@ class LaneFilter:
         doubts[:, 5] = apart_cm**2
         doubts[:, 6] = np.repeat(apart_cm[1::_ROWS], _ROWS) ** 2
         doubts[:, 7] = answer.sigma_cm**2
-        squares = np.square(s.weights)
+        squares = self._doubt_squares
         sigma_cm = np.sqrt(doubts @ squares)
         unknown, reason = sigma_cm > s.most_lanes * self.lane.likely_cm, ""
         if unknown.any():

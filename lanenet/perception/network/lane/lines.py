@@ -39,6 +39,7 @@ class LinesSeen(NamedTuple):
         sigma_cm: Of these; huge where a line is not seen.
         seen_cm: Length along the road in which borders are seen.
         in_view: Bins of 3 cm in which the camera would show them.
+        unseen: Share of these without a border.
         looks: Colour and gaps, see :class:`lanenet.perception.network.refinement.RefinedLines`.
         end_cm: y of the last border; 0 where none is seen.
     """
@@ -47,17 +48,13 @@ class LinesSeen(NamedTuple):
     sigma_cm: Float[np.ndarray, "n 6"]
     seen_cm: Float[np.ndarray, "n 2"]
     in_view: Float[np.ndarray, "n 2"]
+    unseen: Float[np.ndarray, "n 2"]
     looks: Float[np.ndarray, "n 2 3"]
     end_cm: Float[np.ndarray, "n 2"]
 
     def some(self, index: Int[np.ndarray, "m"]) -> LinesSeen:
         """Return those of some lanes, in this order."""
         return LinesSeen(*(each[index] for each in self))
-
-    @property
-    def unseen(self) -> Float[np.ndarray, "n 2"]:
-        """Share of the bins in view without a border."""
-        return np.clip(1.0 - self.seen_cm / _BIN_CM / np.maximum(self.in_view, 1.0), 0.0, 1.0)
 
 
 class LineFinder:
@@ -89,12 +86,14 @@ class LineFinder:
         noise = (sigma**2 + s.least_cm**2) * (1.0 + few**2)
         surprise = ((lines - expected) ** 2 / (spread + noise)).mean(axis=2, keepdims=True)
         noise = noise * (1.0 + surprise / s.surprise)
-        seen = np.broadcast_to((seen_cm >= s.seen_cm)[..., None], lines.shape)
+        seen, bins = (seen_cm >= s.seen_cm)[..., None], seen_cm / _BIN_CM
+        in_view = np.maximum(self._view.bins(lines), bins)
         return LinesSeen(
             np.where(seen, lines, expected).reshape(n, -1),
             np.where(seen, np.sqrt(noise), NOTHING_CM).reshape(n, -1),
             seen_cm,
-            np.maximum(self._view.bins(lines), seen_cm / _BIN_CM),
+            in_view,
+            1.0 - bins / np.maximum(in_view, 1.0),
             best[..., _LOOK],
             np.where(seen_cm > 0.0, best[..., _END], 0.0),
         )
@@ -148,8 +147,10 @@ class LineFinder:
         for side in range(len(SIDES)):
             rows, usual_cm = slice(_ROWS * side, _ROWS * (side + 1)), self.markings.usual_cm(side)
             for marking in _ANY_MARKING if usual_cm is None else [(usual_cm, _KNOWN_SIGMA_CM)]:
-                known = np.broadcast_to([*marking, np.nan, np.nan], (n, 4))
-                asked.append(np.hstack([points_cm[:, rows], sigma_cm[:, rows], known]))
+                line = np.full((n, 10), np.nan)
+                line[:, _POINTS], line[:, _SIGMAS] = points_cm[:, rows], sigma_cm[:, rows]
+                line[:, 6:8] = marking
+                asked.append(line)
                 sides.append(side)
         # In one go, since each look at the edge points has a price.
         found = refined(np.concatenate(asked), borders).reshape(len(asked), n, -1)

@@ -39,10 +39,11 @@ def linearised(
     offset, slope, curvature, log_width = states.T[..., None]
     half_cm = _HALF * np.exp(log_width)
     bend, bend_by_slope, bend_by_curvature = _bend(slope, curvature)
-    y = np.broadcast_to(ROW_CM, half_cm.shape)
+    y = ROW_CM
     for _ in range(2):
         at = slope + bend * y
-        y = ROW_CM + np.clip(half_cm * at / np.sqrt(1.0 + at * at), -_REACH_CM, _REACH_CM)
+        aside_cm = half_cm * at / np.sqrt(1.0 + at * at)
+        y = ROW_CM + np.minimum(np.maximum(aside_cm, -_REACH_CM), _REACH_CM)
     at = slope + bend * y
     across = np.sqrt(1.0 + at * at)
     half_square = 0.5 * y * y
@@ -103,5 +104,6 @@ def _bend(
     steep = 1.0 + slope * slope
     root = np.sqrt(steep)
     bend = curvature * steep * root
-    free = np.abs(bend) < _TIGHTEST
-    return np.clip(bend, -_TIGHTEST, _TIGHTEST), free * 3.0 * curvature * slope * root, free * steep * root
+    free = (np.abs(bend) < _TIGHTEST) * root
+    bend = np.minimum(np.maximum(bend, -_TIGHTEST), _TIGHTEST)
+    return bend, free * (3.0 * curvature * slope), free * steep

@@ -43,5 +43,7 @@ class LinesInView:
     def bins(self, points_cm: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
         """Return how many bins of 3 cm of lines, given by x at the label rows, lie in the image."""
         x = points_cm @ self._x_of_points
-        column = np.rint((x + _ASIDE_CM) / _STEP_CM).astype(np.int64).clip(0, len(self._shown) - 1)
-        return self._shown[column, self._bins].sum(axis=-1).astype(np.float64)
+        column = np.minimum(
+            np.maximum((x + (_ASIDE_CM + 0.5 * _STEP_CM)) / _STEP_CM, 0.0), len(self._shown) - 1
+        )
+        return self._shown[column.astype(np.int64), self._bins].sum(axis=-1).astype(np.float64)
