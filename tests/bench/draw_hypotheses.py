@@ -10,11 +10,9 @@ import sys
 import matplotlib.pyplot as plt
 import numpy as np
 from bench_ablation import ROOT
-from fit_lane import seen
+from fit_lane import filter_of, replayed, seen
 
 from lanenet.geometry.lane import ROWS_CM, parabolas_from_points
-from lanenet.perception.estimate import LaneMemory
-from lanenet.perception.network.lane.filter import LaneFilter
 from lanenet.perception.network.lane.shape import points_of
 
 #: A drive of ``bench_ablation.py`` over the line between two lanes, and frames of it. Chosen by eye.
@@ -25,18 +23,13 @@ AHEAD_CM = np.linspace(-3.0, 42.0, 40)
 def main() -> None:
     """Draw into the file that is named."""
     drive = seen(ROOT / "checkpoints/general", SEED, NUMBER)
-    lane = LaneFilter(LaneMemory(drive.lane_cm), drive.view)
+    lane = filter_of(drive)
     figure, axes = plt.subplots(1, len(FRAMES), figsize=(10.5, 4.2), sharey=True, layout="constrained")
-    for number, step in enumerate(drive.steps[: FRAMES[-1] + 1]):
-        travel_cm, turn_rad = drive.motion[number].tolist()
-        lane.moved(travel_cm, turn_rad, drive.wheelbase_cm)
-        if step is None:
-            lane.lose()
+    for number, found in replayed(drive, lane):
+        step = drive.steps[number]
+        if number not in FRAMES or step is None:
             continue
         answer, edges = step
-        found = lane.follow(answer, edges)
-        if number not in FRAMES:
-            continue
         axis = axes[FRAMES.index(number)]
         axis.plot(*edges.points_cm.T, ".", color="0.6", markersize=1.0)
         weights = np.exp(lane._found.log_weights)

@@ -81,7 +81,7 @@ def seen(model: Path, seed: int, number: int) -> Drive:
     width_cm = frames.lane_width_cm
     assert width_cm is not None and frames.motion is not None
     detector = NetworkDetector(model, frames.camera, any_camera=True, lane_width_cm=width_cm)
-    view = LinesInView(frames.camera)
+    view = LinesInView(frames.camera, detector._extractor.table.keep)
     recorder = Recorder(LaneMemory(width_cm), view)
     recorder.steps, detector._filter = [], recorder
     for index in range(len(frames.frames)):
@@ -90,9 +90,13 @@ def seen(model: Path, seed: int, number: int) -> Drive:
     return Drive(recorder.steps, motion, view, frames.camera.wheelbase_cm, width_cm, frames.points_cm)
 
 
-def replayed(drive: Drive, settings: LaneFilterSettings) -> Iterator[tuple[int, LaneAnswer]]:
-    """Yield the answers of the filter to a drive."""
-    lane = LaneFilter(LaneMemory(drive.lane_cm), drive.view, settings=settings)
+def filter_of(drive: Drive, settings: LaneFilterSettings | None = None) -> LaneFilter:
+    """Return a filter for a drive that has seen none of it."""
+    return LaneFilter(LaneMemory(drive.lane_cm), drive.view, settings=settings)
+
+
+def replayed(drive: Drive, lane: LaneFilter) -> Iterator[tuple[int, LaneAnswer]]:
+    """Yield the answers of a filter to a drive."""
     for number, step in enumerate(drive.steps):
         travel_cm, turn_rad = drive.motion[number].tolist()
         lane.moved(travel_cm, turn_rad, drive.wheelbase_cm)
@@ -107,7 +111,7 @@ def answered(drives: list[Drive], settings: LaneFilterSettings) -> tuple[np.ndar
     errors, doubts = [], []
     raw = settings.model_copy(update={"doubt": settings.doubt.model_copy(update={"most_lanes": np.inf})})
     for drive in drives:
-        for number, answer in replayed(drive, raw):
+        for number, answer in replayed(drive, filter_of(drive, raw)):
             off_cm = answer.points_cm - drive.true_cm[number]
             known = np.isfinite(off_cm)
             errors.append(off_cm[known])

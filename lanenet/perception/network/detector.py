@@ -25,6 +25,7 @@ from lanenet.perception.estimate import SURE, DetectorInputs, DetectorKind, Lane
 from lanenet.perception.network.lane.filter import NOTHING_SEEN, LaneFilter
 from lanenet.perception.network.lane.looks import Keep
 from lanenet.perception.network.lane.network_answer import NetworkAnswer
+from lanenet.perception.network.lane.settings import BorderWeight
 from lanenet.perception.network.lane.view import LinesInView
 from lanenet.perception.network.model_file import (
     INPUT_NAME,
@@ -56,9 +57,9 @@ _CENTRE_TOLERANCE = 0.1
 _NARROW, _WIDE = 0.8, 1.25
 #: Sigma of the width by which one line tells the centre, as a share of it. Chosen: 2 cm of a lane of 40 cm.
 _ONE_LINE = 0.05
-#: Length along the road, [cm], from which a line is seen on its edges; below it what the network says of it
-#: counts by half. Chosen: three bins of the refinement.
-_SEEN_CM = 9.0
+#: Length along the road, [cm], from which a line is seen on its edges, as for the lane filter; below it what
+#: the network says of it counts by half.
+_SEEN_CM = BorderWeight().seen_cm
 #: Why a frame is not answered that is all edges.
 _CROWDED = "the frame is all edges"
 #: Label row at which the car aims, 15 cm ahead.

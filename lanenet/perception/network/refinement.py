@@ -40,8 +40,8 @@ _CORRELATION, _LEAST_VARIANCE = 0.5, 0.05
 #: Least and largest number of edge points of a line, and width of markings.
 _LEAST, _MOST, _MARKING_CM = 6, 128, (0.8, 9.0)
 #: A line is seen in a bin along the road that has a border within this of its place, and length of a bin.
-_SEEN_CM, _BIN_CM = 0.8, 3.0
-_BINS = int((_FAR_CM - _NEAR_CM) / _BIN_CM) + 1
+_SEEN_CM, BIN_CM = 0.8, 3.0
+_BINS = int((_FAR_CM - _NEAR_CM) / BIN_CM) + 1
 #: Nodes of what a line has beyond its parabola, in half rows, and sigma of its third differences: 0 of a
 #: parabola, 5 cm where tape is laid with a kink of 35 degrees. Tried from 0.3 to 2.5.
 _NODE_CM = 7.5
@@ -56,7 +56,7 @@ _ROUGHLY, _GOLDEN = 0.6, 0.6180339887
 #: Bins within 6 cm of each label row: none where a line's place is a guess.
 _BESIDE = np.stack(
     [
-        np.floor((np.arange(-2, 2) * _BIN_CM + y - _NEAR_CM) / _BIN_CM).clip(0.0).astype(np.int64)
+        np.floor((np.arange(-2, 2) * BIN_CM + y - _NEAR_CM) / BIN_CM).clip(0.0).astype(np.int64)
         for y in ROWS_CM
     ]
 )
@@ -82,7 +82,7 @@ _NUMBERS = np.concatenate(
             *(BASIS, _ROW_CORRELATION, _SMOOTH, _NODES_CM, _ROWS_AT, _BESIDE, _GATES_CM, _CAUCHIES_CM),
             *(_NEAR_CM, _FAR_CM, _FIRST_CM, _LAST_CM, _BENT_FIRST_CM, _BENT_CM, _BENT_SIGMAS, _LOOSE_CM),
             *(_COSINE, _ROUGHLY, _EDGE_CM, _EDGE_GROWTH, _CAUCHY_CM, _INDEPENDENT, _HUE, _LEAST, _MOST),
-            *(_MARKING_CM, _SEEN_CM, _BIN_CM, _NODE_CM, _GOLDEN, _LEAST_VARIANCE, _BENT_STEPS),
+            *(_MARKING_CM, _SEEN_CM, BIN_CM, _NODE_CM, _GOLDEN, _LEAST_VARIANCE, _BENT_STEPS),
         )
     ]
 ).astype(np.float64)
@@ -317,7 +317,7 @@ def _refine(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> RefinedLi
     seen[
         row,
         (agree[row, column] > 0.0).astype(np.int64),
-        ((y[row, column] - _NEAR_CM) / _BIN_CM).astype(np.int64),
+        ((y[row, column] - _NEAR_CM) / BIN_CM).astype(np.int64),
     ] = True
     filled = np.asarray(seen.any(axis=1))
     points = np.where(enough[:, None], found[:, :3] + extra_cm[:, _ROWS_AT], start[:, :3])
@@ -327,14 +327,14 @@ def _refine(asked: Float[np.ndarray, "m 10"], borders: RoadBorders) -> RefinedLi
         points,
         np.sqrt(variance),
         found[:, 3],
-        0.5 * _BIN_CM * seen.sum(axis=(1, 2)),
+        0.5 * BIN_CM * seen.sum(axis=(1, 2)),
         np.any(seen[:, :, _BESIDE], axis=(1, 3)),
         _look(
             sign[:, None] * _sum(met[:, :, None] * edges.hues[index], 1),
             met.sum(axis=1),
             filled,
         ),
-        _NEAR_CM + _BIN_CM * np.where(filled.any(axis=1), _last(filled), 0),
+        _NEAR_CM + BIN_CM * np.where(filled.any(axis=1), _last(filled), 0),
     )
 
 

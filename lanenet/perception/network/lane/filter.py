@@ -107,6 +107,8 @@ class LaneFilter:
         """Know no lane yet."""
         self.lane, self._settings = lane, settings or LaneFilterSettings()
         self._doubt_squares = np.square(self._settings.doubt.weights)
+        #: Variance of a line about the curve of its state, at each row.
+        self._shape = (self._settings.shape_cm + self._settings.shape_per_cm * ROW_CM) ** 2
         self.looks, self._lines = LineLooks(keep), LineFinder(view, self._settings.borders)
         self.reset()
 
@@ -150,17 +152,16 @@ class LaneFilter:
         before_cm = expected[0][0]
         found, by_network = self._drawn_to_network(found, expected, is_new, answer)
         points, change = expected = linearised(found.states)
-        shape = (s.shape_cm + s.shape_per_cm * ROW_CM) ** 2
-        variance = variances(change, found.covariances) + shape
+        variance = variances(change, found.covariances) + self._shape
         lines = self._lines.find(points, np.sqrt(variance), borders)
         before, found = (
             found,
             found.updated(
-                expected, lines.points_cm, np.sqrt(lines.sigma_cm**2 + shape), s.network.correlation
+                expected, lines.points_cm, np.sqrt(lines.sigma_cm**2 + self._shape), s.network.correlation
             ),
         )
         # Where a line shows no border it may turn away.
-        shape = shape + (s.bend_per_cm * ROW_CM * np.repeat(lines.unseen, _ROWS, axis=1)) ** 2
+        shape = self._shape + (s.bend_per_cm * ROW_CM * np.repeat(lines.unseen, _ROWS, axis=1)) ** 2
         # To first order: edges move a lane that the network has placed by little.
         points = points + (change @ (found.states - before.states)[..., None])[..., 0]
         variance = variances(change, found.covariances) + shape
@@ -288,8 +289,7 @@ class LaneFilter:
         of what is left, less that distribution, are a measurement. So two places stay two.
         """
         s, (points, change) = self._settings.network, expected
-        shape = (self._settings.shape_cm + self._settings.shape_per_cm * ROW_CM) ** 2
-        window = np.maximum(variances(change, found.covariances) + shape, s.window_cm**2)
+        window = np.maximum(variances(change, found.covariances) + self._shape, s.window_cm**2)
         power = s.weight * (s.unseen_weight + (1.0 - s.unseen_weight) * np.repeat(answer.presence, _ROWS))
         share = (np.exp(answer.log_share) + s.least_share) ** power[:, None]
         places = answer.places_cm

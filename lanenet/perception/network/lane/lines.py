@@ -13,13 +13,11 @@ from lanenet.perception.estimate import SEEN
 from lanenet.perception.network.lane.marking_widths import MarkingWidths
 from lanenet.perception.network.lane.settings import BorderWeight
 from lanenet.perception.network.lane.view import LinesInView
-from lanenet.perception.network.refinement import RoadBorders, refined
+from lanenet.perception.network.refinement import BIN_CM, RoadBorders, refined
 
 _ROWS = len(ROWS_CM)
 #: Sigma of a line that is not seen, [cm]: it measures nothing.
 NOTHING_CM = 1e4
-#: Length along the road in which a border is counted once, [cm], as the refinement does.
-_BIN_CM = 3.0
 #: Length of borders of a line that tells the width of its marking, or of the lane, [cm]. Chosen: a third of
 #: what is looked at.
 MEASURED_CM = 15.0
@@ -86,7 +84,7 @@ class LineFinder:
         noise = (sigma**2 + s.least_cm**2) * (1.0 + few**2)
         surprise = ((lines - expected) ** 2 / (spread + noise)).mean(axis=2, keepdims=True)
         noise = noise * (1.0 + surprise / s.surprise)
-        seen, bins = (seen_cm >= s.seen_cm)[..., None], seen_cm / _BIN_CM
+        seen, bins = (seen_cm >= s.seen_cm)[..., None], seen_cm / BIN_CM
         in_view = np.maximum(self._view.bins(lines), bins)
         return LinesSeen(
             np.where(seen, lines, expected).reshape(n, -1),
@@ -100,7 +98,7 @@ class LineFinder:
 
     def log_likelihood(self, lines: LinesSeen) -> Float[np.ndarray, "n"]:
         """Log likelihood of the borders that are seen, and of those that are not, over those of clutter."""
-        s, seen = self._settings, lines.seen_cm / _BIN_CM
+        s, seen = self._settings, lines.seen_cm / BIN_CM
         met = math.log(s.seen_share / s.clutter_share)
         missed = math.log((1.0 - s.seen_share) / (1.0 - s.clutter_share))
         return s.weight * (seen * met + (lines.in_view - seen) * missed).sum(axis=1)

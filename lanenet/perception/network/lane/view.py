@@ -7,9 +7,10 @@ from jaxtyping import Bool, Float, UInt8
 
 from lanenet.geometry.camera import Camera
 from lanenet.geometry.lane import PARABOLA_FROM_POINTS
+from lanenet.perception.network.refinement import BIN_CM
 
 #: y of the middles of the bins of 3 cm in which :mod:`lanenet.perception.network.refinement` counts borders.
-_BINS_CM = np.arange(-2.5, 42.0, 3.0)
+_BINS_CM = np.arange(-2.5, 42.0, BIN_CM)
 #: Ground to either side that is looked at, and in which steps. Chosen: as far as a line of the car's lane or
 #: the next one may lie.
 _ASIDE_CM, _STEP_CM = 120.0, 2.0
